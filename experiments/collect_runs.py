@@ -93,16 +93,19 @@ def errors_table(runs: Sequence[Evaluation], horizons: Sequence[float] | None = 
             row: list[Cell | str] = [group, Cell((horizon,), "g")]
             for quantity, (form, _) in _FORMS.items():
                 row += [
-                    Cell((group_mean(first.vanilla, group, quantity, horizon),), form),
-                    Cell(tuple(group_mean(run.residual, group, quantity, horizon) for run in runs), form),
+                    Cell((mean_over_recordings(first.vanilla, group, quantity, horizon),), form),
+                    Cell(tuple(mean_over_recordings(run.residual, group, quantity, horizon) for run in runs), form),
                     Cell(tuple(run.ratio(group, quantity, horizon) for run in runs), spread=False),
                 ]
             rows.append(tuple(row))
     return Table(tuple(columns), tuple(rows))
 
 
-def group_mean(side: Sequence[Errors], group: str, quantity: str, horizon: float) -> float:
-    """Return a simulator's mean error (m or deg) over a group's recordings. Infinite if all starts of one diverged."""
+def mean_over_recordings(side: Sequence[Errors], group: str, quantity: str, horizon: float) -> float:
+    """Return a simulator's mean error (m or deg) over a group's recordings. Infinite if all starts of one diverged.
+
+    `errors.group_mean` leaves out such recordings. Its tables count the starts that diverged, and these tables do not.
+    """
     return float(np.mean([getattr(errors, quantity)[horizon][0] for errors in side if errors.group == group]))
 
 
@@ -117,7 +120,9 @@ def remaining_errors(
     `columns` are pairs of group and quantity. `simulators` holds the errors of all seeds, by label. Cells have one
     value for each seed.
     """
-    rows = {"vanilla": [Cell((group_mean(vanilla, *column, horizon),), *_FORMS[column[1]]) for column in columns]}
+    rows = {
+        "vanilla": [Cell((mean_over_recordings(vanilla, *column, horizon),), *_FORMS[column[1]]) for column in columns]
+    }
     for label, runs in simulators.items():
         rows[label] = [Cell(tuple(error_ratio(run, vanilla, *column, horizon) for run in runs)) for column in columns]
     return rows

@@ -241,7 +241,7 @@ def figure(found: Mapping[str, Sequence[Evaluation]], path: Path) -> None:
         }
         for label, sides in curves.items():
             values = np.array(
-                [[collect_runs.group_mean(side, group, "position", h) for h in horizons] for side in sides]
+                [[collect_runs.mean_over_recordings(side, group, "position", h) for h in horizons] for side in sides]
             )
             (line,) = axis.plot(horizons, values.mean(axis=0), marker="o", label=label, color=COLOURS.get(label))
             axis.fill_between(horizons, values.min(0), values.max(0), color=line.get_color(), alpha=0.2, linewidth=0)
