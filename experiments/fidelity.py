@@ -316,11 +316,11 @@ class Options:
     methods: list[str]
     seeds: list[int]
     robot: int
+    robot_family: RobotFamily
     fresh: int
     output: Path
     quick: bool
     results: Path | None
-    robot_family: RobotFamily
 
     @property
     def hardware(self) -> VirtualHardware:
@@ -347,9 +347,8 @@ def parse() -> Options:
     parser.add_argument("--results", type=Path, help="JSON file to write the tables to")
     arguments = parser.parse_args()
     needed = {*always, *arguments.methods, *(METHODS[name].beside for name in arguments.methods)}
-    methods = [name for name in METHODS if name in needed]
-    chosen = (arguments.seeds, arguments.robot, arguments.fresh, arguments.output, arguments.quick, arguments.results)
-    return Options(methods, *chosen, arguments.robot_family)
+    arguments.methods = [name for name in METHODS if name in needed]
+    return Options(**vars(arguments))
 
 
 def arguments_of(method: Method, recorded: Recorded, training: list[Path], quick: bool) -> list[str]:

@@ -24,14 +24,20 @@ from ballu_mjx.robots.description import RobotDescription, read_description
 from ballu_mjx.robots.model import same_parameters
 
 
-@pytest.fixture(scope="module")
-def robot(tmp_path_factory: pytest.TempPathFactory) -> RobotDescription:
-    """Return the description of the servo arm, with recordings beside it."""
-    folder = tmp_path_factory.mktemp("arm")
+def write_recorded_arm(folder: Path) -> RobotDescription:
+    """Write the servo arm with a recording for training and one for validation. Return its description."""
     robot = write_arm(folder)
     for use, seed in (("training", 0), ("validation", 1)):
         (folder / use).mkdir()
         record_arm(folder / use, robot, f"motion-{seed}", seed)
+    return robot
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> RobotDescription:
+    """Return the description of the servo arm, with recordings beside it."""
+    folder = tmp_path_factory.mktemp("arm")
+    robot = write_recorded_arm(folder)
     (folder / "sweep").mkdir()
     record_arm(folder / "sweep", robot, "sweep", 0, "suspended")
     return robot
@@ -144,10 +150,7 @@ def test_identified_actuators_are_used_by_default_if_they_replay_better(
 
 @pytest.mark.parametrize("diverges", ["nominal", "identified"])
 def test_stability_is_checked_for_the_actuators_in_use(tmp_path: Path, diverges: str):
-    robot = write_arm(tmp_path)
-    for use, seed in (("training", 0), ("validation", 1)):
-        (tmp_path / use).mkdir()
-        record_arm(tmp_path / use, robot, f"motion-{seed}", seed)
+    robot = write_recorded_arm(tmp_path)
     stiffness = {"nominal": 0.0, "identified": 0.0, diverges: 1e4}  # N m/rad; 1e4 is too stiff for the time step
     model = tmp_path / "arm.xml"
     model.write_text(model.read_text().replace('name="elbow"', f'name="elbow" stiffness="{stiffness["nominal"]}"'))

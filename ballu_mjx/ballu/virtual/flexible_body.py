@@ -12,9 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from ballu_mjx.ballu.model import SIDES
+from ballu_mjx.ballu.virtual.air import add_air
 
-AIR = "air"
-"""Prefix of the names of the ellipsoids of air."""
 _BALLOON_SHARE = 0.75
 """Share of the balloon cluster's mass that is in the balloons. The rest is in their frame. An assumption."""
 
@@ -45,8 +44,21 @@ class FlexibleBody:
     """Stiffness (N/m) that is added from this stretch on."""
 
 
-def make_flexible(spec: mujoco.MjSpec, flexible: FlexibleBody) -> None:
-    """Give the model of the nominal robot a flexible body, in place, except for the balloons (`split_balloons`)."""
+def make_flexible(
+    spec: mujoco.MjSpec,
+    flexible: FlexibleBody,
+    offset: tuple[float, float, float],
+    lift: float,
+    added_mass: float,
+) -> None:
+    """Give the model of the nominal robot a flexible body, in place. `harden_cables` completes it once it is compiled.
+
+    **Arguments**
+
+    - `offset`: offset of all balloons from their nominal places (m, balloon frame).
+    - `lift`: lift of all balloons (N).
+    - `added_mass`: added mass of all balloons (kg), whose weight the lift carries in addition.
+    """
     for body, ratio in zip(spec.bodies[1:], flexible.mass_ratio, strict=True):
         body.mass *= ratio
         body.inertia *= ratio
@@ -62,6 +74,7 @@ def make_flexible(spec: mujoco.MjSpec, flexible: FlexibleBody) -> None:
     for (name, axis), stiffness in zip((("roll", (1, 0, 0)), ("yaw", (0, 0, 1))), flexible.neck_stiffness, strict=True):
         joint = balloon.add_joint(name=f"neck_{name}", type=mujoco.mjtJoint.mjJNT_HINGE, axis=axis)
         joint.stiffness[0], joint.damping[0] = stiffness, flexible.neck_damping
+    _split_balloons(spec, flexible, offset, lift, added_mass)
 
 
 def _scale_leg(spec: mujoco.MjSpec, side: str, thigh: float, shank: float) -> None:
@@ -82,7 +95,7 @@ def harden_cables(model: mujoco.MjModel, flexible: FlexibleBody) -> None:
         model.tendon_lengthspring[second] = 0.0, model.tendon_lengthspring[first, 1] + flexible.cable_toe[index]
 
 
-def split_balloons(
+def _split_balloons(
     spec: mujoco.MjSpec,
     flexible: FlexibleBody,
     offset: tuple[float, float, float],
@@ -91,15 +104,9 @@ def split_balloons(
 ) -> None:
     """Replace the rigid balloon cluster by a frame and balloons on springs, each with air of its own, in place.
 
-    The balloons stand at the places of the nominal model's ellipsoids when the robot is upright and at rest, moved by
-    less than a millimetre so that their mean is the cluster's centre of mass. Together with their frame, they have the
-    mass and the inertia of the rigid cluster.
-
-    **Arguments**
-
-    - `offset`: offset of all balloons from their nominal places (m, balloon frame).
-    - `lift`: lift of all balloons (N).
-    - `added_mass`: added mass of all balloons (kg), whose weight the lift carries in addition.
+    When the robot is upright and at rest, the balloons stand at the places of the nominal model's ellipsoids. They are
+    moved by less than a millimetre, so that their mean is the cluster's centre of mass. Together with their frame, they
+    have the mass and the inertia of the rigid cluster. The arguments are those of `make_flexible`.
     """
     frame = spec.body("balloon")
     shapes = [geom for geom in frame.geoms if geom.type == mujoco.mjtGeom.mjGEOM_ELLIPSOID]
@@ -117,23 +124,14 @@ def split_balloons(
         taken += inertia + mass * _point_inertia(place - frame.ipos)
         body = frame.add_body(name=f"balloon_{index}", pos=place + offset)
         body.explicitinertial = True
-        body.mass, body.inertia, body.ipos = moving, inertia, np.zeros(3)
-        body.gravcomp = (lift / len(shapes) + (moving - mass) * gravity) / (moving * gravity)
+        body.mass, body.inertia, body.ipos = mass, inertia, np.zeros(3)
+        add_air(spec, body, f"air_{index}", lift / len(shapes), added_mass / len(shapes), shape.size)
         for axis, direction in enumerate(np.eye(3)):
             joint = body.add_joint(
                 name=f"balloon_{index}_{'xyz'[axis]}", type=mujoco.mjtJoint.mjJNT_SLIDE, axis=direction
             )
             joint.stiffness[0], joint.springref = stiffness, at_rest[axis]
             joint.damping[0] = 2 * flexible.balloon_damping * moving * rate
-        body.add_geom(
-            name=f"{AIR}_{index}",
-            type=mujoco.mjtGeom.mjGEOM_ELLIPSOID,
-            size=shape.size,
-            contype=0,
-            conaffinity=0,
-            group=4,
-            fluid_ellipsoid=1,
-        )
     frame.mass -= mass * len(shapes)
     frame.inertia -= taken
     frame.gravcomp = 0.0

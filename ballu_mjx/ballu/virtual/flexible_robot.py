@@ -14,21 +14,19 @@ The values are assumptions. They were set before any method was run on these rob
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import numpy as np
 
 from ballu_mjx.ballu.model import load_model
 from ballu_mjx.ballu.virtual.flexible_body import FlexibleBody
-from ballu_mjx.ballu.virtual.robot import VirtualRobot, draw_robot
+from ballu_mjx.ballu.virtual.robot import VirtualRobot, draw_pair, draw_robot
 
 
 def draw_flexible_robot(seed: int) -> VirtualRobot:
     """Draw one robot of the family."""
     rng = np.random.default_rng([seed, 5])
-
-    def pair(low: float, high: float) -> tuple[float, float]:
-        first, second = rng.uniform(low, high, 2)
-        return float(first), float(second)
+    pair = functools.partial(draw_pair, rng)
 
     def ratios(error: float, count: int) -> tuple[float, ...]:
         return tuple(1 + float(each) for each in rng.uniform(-error, error, count))

@@ -18,6 +18,7 @@ Code that trains must not import this module's robots. It may know them only by 
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 
 import jax.numpy as jnp
@@ -29,7 +30,8 @@ from scipy.spatial.transform import Rotation
 from ballu_mjx.ballu.actuators import CABLE_SLACK, SERVO_RANGE, ActuatorParameters, actuator_fields
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, SIDES, load_model, standing_qpos, suspend
 from ballu_mjx.ballu.recordings import make_recording
-from ballu_mjx.ballu.virtual.flexible_body import AIR, FlexibleBody, harden_cables, make_flexible, split_balloons
+from ballu_mjx.ballu.virtual.air import add_air, leave_drag_lift_and_magnus_force
+from ballu_mjx.ballu.virtual.flexible_body import FlexibleBody, harden_cables, make_flexible
 from ballu_mjx.policies.deploy.estimator import Capture
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.robots.model import assets, set_fields
@@ -120,14 +122,16 @@ def still(trial: TrialConditions) -> TrialConditions:
     return dataclasses.replace(trial, draught=(0.0, 0.0, 0.0), draught_swing=(0.0, trial.draught_swing[1]))
 
 
+def draw_pair(rng: np.random.Generator, low: float, high: float) -> tuple[float, float]:
+    """Draw two values, uniformly between `low` and `high`."""
+    first, second = rng.uniform(low, high, 2)
+    return float(first), float(second)
+
+
 def draw_robot(seed: int) -> VirtualRobot:
     """Draw one robot of the family."""
     rng = np.random.default_rng([seed, 1])
-
-    def pair(low: float, high: float) -> tuple[float, float]:
-        left, right = rng.uniform(low, high, 2)
-        return float(left), float(right)
-
+    pair = functools.partial(draw_pair, rng)
     degree = np.pi / 180
     side = rng.choice([-1.0, 1.0])
     return VirtualRobot(
@@ -178,10 +182,12 @@ def build(virtual: VirtualRobot, *, suspended: bool = False) -> mujoco.MjModel:
     nominal = load_model()
     lift = virtual.buoyancy * float(nominal.body_mass.sum() * np.linalg.norm(nominal.opt.gravity))
     if virtual.flexible is None:
-        _add_rigid_air(spec, virtual, lift)
+        balloon = spec.body("balloon")
+        balloon.ipos += virtual.balloon_offset
+        balloon.inertia += virtual.added_inertia
+        add_air(spec, balloon, "air", lift, virtual.added_mass, virtual.balloon_semi_axes)
     else:
-        make_flexible(spec, virtual.flexible)
-        split_balloons(spec, virtual.flexible, virtual.balloon_offset, lift, virtual.added_mass)
+        make_flexible(spec, virtual.flexible, virtual.balloon_offset, lift, virtual.added_mass)
     for index, side in enumerate(SIDES):
         spec.joint(f"knee_{side}").frictionloss = virtual.knee_friction[index]
         spec.joint(f"motor_{side}").frictionloss = virtual.motor_friction[index]
@@ -198,50 +204,8 @@ def build(virtual: VirtualRobot, *, suspended: bool = False) -> mujoco.MjModel:
     if virtual.flexible is not None:
         harden_cables(model, virtual.flexible)
     mujoco.mj_setConst(model, mujoco.MjData(model))
-    _leave_drag_lift_and_magnus_force(model)
+    leave_drag_lift_and_magnus_force(model)
     return model
-
-
-def _add_rigid_air(spec: mujoco.MjSpec, virtual: VirtualRobot, lift: float) -> None:
-    """Give the balloon's body a lift (N), an offset, an added mass and inertia, and an ellipsoid of air, in place."""
-    balloon = spec.body("balloon")
-    gravity = float(np.linalg.norm(spec.option.gravity))
-    balloon.ipos += virtual.balloon_offset
-    balloon.mass += virtual.added_mass
-    balloon.inertia += virtual.added_inertia
-    balloon.gravcomp = (lift + virtual.added_mass * gravity) / (balloon.mass * gravity)
-    balloon.add_geom(
-        name=AIR,
-        type=mujoco.mjtGeom.mjGEOM_ELLIPSOID,
-        size=virtual.balloon_semi_axes,
-        pos=balloon.ipos,
-        contype=0,
-        conaffinity=0,
-        group=4,
-        fluid_ellipsoid=1,
-    )
-
-
-def _leave_drag_lift_and_magnus_force(model: mujoco.MjModel) -> None:
-    """Remove from MuJoCo's fluid model the parts that this robot's air does not have, in place.
-
-    - The virtual mass and inertia of the ellipsoid. MuJoCo has only their velocity-dependent forces, and the body
-      already has the complete added mass. The mass `added_mass` at the centre has the momentum m v, whose rate of
-      change in the body frame is m (dv/dt + w x v). This is Kirchhoff's force for added masses that are equal along all
-      axes. There is no Munk moment (m v x v = 0).
-    - The drag of the other bodies. A body without an ellipsoid would have the drag of its inertia box. A body whose
-      coefficients are all 0 has none.
-    """
-    air = [index for index in range(model.ngeom) if model.geom(index).name.startswith(AIR)]
-    model.geom_fluid[air, _VIRTUAL_MASS] = 0.0
-    for body in range(1, model.nbody):
-        if body not in model.geom_bodyid[air]:
-            model.geom_fluid[model.body_geomadr[body]] = np.eye(model.geom_fluid.shape[1])[0]
-
-
-_VIRTUAL_MASS = slice(6, 12)
-"""Columns of virtual mass and inertia in a row of `geom_fluid`. The columns before them are the interaction and five
-coefficients of drag, lift and Magnus force."""
 
 
 @dataclasses.dataclass
