@@ -11,6 +11,7 @@ from pathlib import Path
 import mujoco
 
 from ballu_mjx.robots.description_fields import is_name, refuse, said, shown
+from ballu_mjx.robots.kinematic_trees import linked_roots
 
 
 def read_model(path: Path, place: Path) -> mujoco.MjModel:
@@ -104,7 +105,7 @@ def check_sites(path: Path, model: mujoco.MjModel, tracked: str, points: tuple[s
 
     **Raises** `InputError` if a site is missing, does not move, or belongs to another robot than the tracked site.
     """
-    linked, roots = _linked_roots(model), []
+    linked, roots = linked_roots(model), []
     for key, site in (("tracked", tracked), *(("points", point) for point in points)):
         body = model.site_bodyid[find_part(path, model, mujoco.mjtObj.mjOBJ_SITE, key, site)]
         roots.append(linked[int(model.body_rootid[body])])
@@ -114,21 +115,6 @@ def check_sites(path: Path, model: mujoco.MjModel, tracked: str, points: tuple[s
             problem = f'"{key}" names {shown(site)}, which belongs to another robot than {tracked}'
             fix = "name sites below one child of the world body, or connect their bodies by an equality"
             refuse(path, problem, fix)
-
-
-def _linked_roots(model: mujoco.MjModel) -> dict[int, int]:
-    """Return a representative of each root body. Root bodies that equalities (closed loops) connect share one."""
-    linked = {int(root): int(root) for root in model.body_rootid}
-    for number in range(model.neq):
-        ends = [int(model.eq_obj1id[number]), int(model.eq_obj2id[number])]
-        if int(model.eq_type[number]) not in (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD)):
-            continue
-        if model.eq_objtype[number] == mujoco.mjtObj.mjOBJ_SITE:
-            ends = [int(model.site_bodyid[site]) for site in ends]
-        one, other = (linked[int(model.body_rootid[body])] for body in ends)
-        if 0 not in (one, other):
-            linked = {root: one if stand_in == other else stand_in for root, stand_in in linked.items()}
-    return linked
 
 
 def check_actuators(

@@ -247,6 +247,8 @@ def _newton_step(found: _Solution, model: mjx.Model, data: mjx.Data) -> tuple[_S
 
     The Hessian of the cost is held constant, because the factor of its derivative is zero at the minimum.
     """
+    # MJX's other solver would leave the constraints out of the Hessian.
+    model = model.tree_replace({"opt.solver": mjx.SolverType.NEWTON})
     data = data.replace(qacc=found.qacc)  # pyright: ignore
     here = Context.create(model, data, grad=False)
     gradient = here.Ma - data.qfrc_smooth - here.qfrc_constraint
@@ -271,16 +273,17 @@ def solve_constraints(model: mjx.Model, data: mjx.Data) -> _Solution:
     """Return accelerations and generalized forces of the constraints, like `mjx.solve`.
 
     If the solver converges, the derivative is that of the minimum alone, which takes half the time. This is so for
-    models with enough iterations. Without contacts the cost is piecewise quadratic in a few rows, and few iterations
-    suffice in double precision.
+    Newton's method with enough iterations. Without contacts the cost is piecewise quadratic in a few rows, and few
+    iterations suffice in double precision.
     """
     few_rows = data.qpos.dtype == jnp.float64 and not data._impl.ncon  # pyright: ignore
-    converges = few_rows or model.opt.iterations >= _ENOUGH_ITERATIONS
+    newton = model.opt.solver == mujoco.mjtSolver.mjSOL_NEWTON
+    converges = newton and (few_rows or model.opt.iterations >= _ENOUGH_ITERATIONS)
     return (_solve_to_minimum if converges else _solve_with_check)(model, data)
 
 
 _ENOUGH_ITERATIONS = 4
-"""Number of iterations after which the derivative of the minimum is that of the simulation.
+"""Number of Newton's iterations after which the derivative of the minimum is that of the simulation.
 
 With 3 iterations, derivatives of BALLU's control steps by a force differ by 9 % or more in one of twenty steps (from
 finite differences). With 4, they differ by 0.1 % or more in one of fifty."""

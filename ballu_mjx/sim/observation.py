@@ -61,18 +61,21 @@ class ObservationLayout:
 
 
 def observe_features(
-    data: mjx.Data, sites: Int[np.ndarray, " sites"], bodies: Int[np.ndarray, " sites"], root: int = 1
+    data: mjx.Data,
+    sites: Int[np.ndarray, " sites"],
+    bodies: Int[np.ndarray, " sites"],
+    roots: Int[np.ndarray, " sites"],
 ) -> Float[Array, " features"]:
     """Return the features of a state that motion capture measures, in the world frame.
 
     In the order of `ObservationLayout`, they are position (m), velocity (m/s) and Euler angles (roll, pitch, yaw; rad)
     of the tracked body, then position and velocity of each point. `sites` are the ids of the measured sites, the
-    tracked one first. `bodies` are the ids of their bodies, all in the kinematic tree whose root is the body `root`.
+    tracked one first. `bodies` are the ids of their bodies, and `roots` of the roots of these bodies' kinematic trees.
     `data` must hold current results of `com_vel`.
     """
     position = data.site_xpos[sites]
-    offset = position - data.subtree_com[root]
-    # cvel is the spatial velocity (angular, linear) about the whole robot's centre of mass.
+    offset = position - data.subtree_com[roots]
+    # cvel is the spatial velocity (angular, linear) about the centre of mass of the body's kinematic tree.
     velocity = data.cvel[bodies, 3:] + jnp.cross(data.cvel[bodies, :3], offset)
     euler = euler_angles(data.xquat[bodies[0]])
     kinematics = jnp.concatenate([position, velocity], axis=1)

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float
 from mujoco import mjx
 
 from ballu_mjx.robots.description import RobotDescription
+from ballu_mjx.robots.kinematic_trees import mass_shares
 from ballu_mjx.robots.model import ModelParameters, bare_parameters, with_fields
 from ballu_mjx.sim.derived_constants import ReferencePose, with_derived_constants
 from ballu_mjx.sim.drivetrain import (
@@ -73,9 +74,9 @@ class Simulator:
         self._reference_pose = ReferencePose.of(self.mj_model)
         sites = [self.mj_model.site(name).id for name in (robot.tracked, *robot.points)]
         bodies = self.mj_model.site_bodyid[sites]
-        self._root = int(self.mj_model.body_rootid[bodies[0]])
-        self._sites = tuple(zip(sites, bodies.tolist(), strict=True))
-        self._masses = jnp.asarray(self.mj_model.body_mass / self.mj_model.body_mass.sum())
+        roots = self.mj_model.body_rootid[bodies]
+        self._sites = tuple(zip(sites, bodies.tolist(), roots.tolist(), strict=True))
+        self._mass_shares = jnp.asarray(mass_shares(self.mj_model, robot.tracked))
 
     def with_fields(self, fields: Mapping[str, Array]) -> Simulator:
         """Return a copy of the simulator with other model fields, and with the constants that MuJoCo derives from them.
@@ -117,7 +118,7 @@ class Simulator:
 
     def observe(self, state: PhysicsState) -> tuple[Float[Array, " features"], Float[Array, " 3"]]:
         """Return the features and the centre of mass (m, world frame) of a state."""
-        return _observe(self.model, self._template, state, self._masses, self._sites, self._root)
+        return _observe(self.model, self._template, state, self._mass_shares, self._sites)
 
     def observe_all(
         self, qpos: Float[Array, "... nq"], qvel: Float[Array, "... nv"]
@@ -129,7 +130,7 @@ class Simulator:
         shape, count = qpos.shape[:-1], math.prod(qpos.shape[:-1])
         flat = state_at(qpos.reshape(count, -1), qvel.reshape(count, -1))
         parts = [PhysicsState(*(x[rows] for x in flat)) for rows, _ in chunks(count, _CHUNK)]
-        fixed = self._masses, self._sites, self._root
+        fixed = self._mass_shares, self._sites
         pieces = [_observe_chunk(self.model, self._template, part, *fixed) for part in parts]
         features, com = (jnp.concatenate(parts)[:count] for parts in zip(*pieces, strict=True))
         return features.reshape(*shape, -1), com.reshape(*shape, -1)
@@ -187,7 +188,7 @@ class Simulator:
         - `joint_force`: generalized forces (N, N m, along `mjx.Data.qvel`). None if there are none.
         """
         commands = self._in_substeps(ctrl)
-        sites, bodies = zip(*self._sites[: len(wrench)], strict=True)
+        sites, bodies, _ = zip(*self._sites[: len(wrench)], strict=True)
         template = self._template
         if joint_force is not None:
             template = template.replace(qfrc_applied=template.qfrc_applied + joint_force)  # pyright: ignore
@@ -390,37 +391,38 @@ class AugmentedSimulator:
         return (1 - self.scale) * commands[-1] + self.scale * sent, action.scaled(self.scale)
 
 
-@functools.partial(jax.jit, static_argnames=("sites", "root"))
+@functools.partial(jax.jit, static_argnames="sites")
 def _observe(
     model: mjx.Model,
     template: mjx.Data,
     state: PhysicsState,
-    masses: Float[Array, " bodies"],
-    sites: tuple[tuple[int, int], ...],
-    root: int,
+    shares: Float[Array, " bodies"],
+    sites: tuple[tuple[int, int, int], ...],
 ) -> tuple[Float[Array, " features"], Float[Array, " 3"]]:
-    """Implement `Simulator.observe`. `masses` are fractions of the total; `sites` are pairs of site id and body id."""
-    site, body = np.array(sites).T
+    """Implement `Simulator.observe`.
 
-    def seen(model: mjx.Model, template: mjx.Data, state: PhysicsState, masses: Array) -> tuple[Array, Array]:
+    `shares` are those of `mass_shares`. `sites` are the ids of each site, its body, and the root of the body's tree.
+    """
+    ids = np.array(sites).T
+
+    def seen(model: mjx.Model, template: mjx.Data, state: PhysicsState, shares: Array) -> tuple[Array, Array]:
         data = load_state(template, state)
         data = mjx.com_vel(model, mjx.com_pos(model, mjx.kinematics(model, data)))
-        return observe_features(data, site, body, root), masses @ data.xipos
+        return observe_features(data, *ids), shares @ data.xipos
 
-    return vmap_with_trailing_batch(seen)(model, template, state, masses)
+    return vmap_with_trailing_batch(seen)(model, template, state, shares)
 
 
 _CHUNK = 1024
 """Number of states that `Simulator.observe_all` processes at a time."""
 
 
-@functools.partial(jax.jit, static_argnames=("sites", "root"))
+@functools.partial(jax.jit, static_argnames="sites")
 def _observe_chunk(
     model: mjx.Model,
     template: mjx.Data,
     states: PhysicsState,
-    masses: Float[Array, " bodies"],
-    sites: tuple[tuple[int, int], ...],
-    root: int,
+    shares: Float[Array, " bodies"],
+    sites: tuple[tuple[int, int, int], ...],
 ) -> tuple[Float[Array, "states features"], Float[Array, "states 3"]]:
-    return jax.vmap(lambda state: _observe(model, template, state, masses, sites, root))(states)
+    return jax.vmap(lambda state: _observe(model, template, state, shares, sites))(states)

@@ -135,3 +135,38 @@ def test_derivatives_of_control_steps_agree_with_finite_differences(iterations: 
     errors = np.linalg.norm(jacobian - expected, axis=(1, 2)) / np.linalg.norm(expected, axis=(1, 2))
     assert np.median(errors) < 1e-5
     assert np.quantile(errors, 0.9) < 1e-3, "contacts that open or close within the change differ"
+
+
+PENDULUM = """
+<mujoco>
+  <option timestep="0.01" gravity="0 0 0" iterations="{iterations}" ls_iterations="20" solver="{solver}">
+    <flag contact="disable"/>
+  </option>
+  <worldbody>
+    <body><joint name="first" axis="0 1 0" limited="true" range="-90 0"/><geom type="sphere" size="0.1" mass="1"/>
+      <body pos="0 0 -0.5"><joint name="second" axis="0 1 0"/><geom type="sphere" size="0.05" mass="0.5"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -0.5" size="0.02" mass="0.2"/></body></body>
+  </worldbody>
+  <actuator><motor joint="first"/><motor joint="second"/></actuator>
+</mujoco>
+"""
+"""A double pendulum whose first joint rests in its limit."""
+
+
+@pytest.mark.parametrize(("solver", "iterations"), [("Newton", 3), ("CG", 3), ("CG", 100)])
+def test_derivatives_in_a_joint_limit_agree_with_finite_differences(solver: str, iterations: int) -> None:
+    model = mujoco.MjModel.from_xml_string(PENDULUM.format(solver=solver, iterations=iterations))
+    with jax.enable_x64(True):
+        system, template = put_model(model), make_data(model)
+        state = state_at(jnp.array([0.001, 0.3]), jnp.array([0.1, -0.4]))
+
+        def after(torque: jax.Array) -> jax.Array:
+            return control_step(system, template, state, torque, jnp.zeros((1, 6)), bodies=(1,), count=1).qvel
+
+        torque, change = jnp.array([0.2, -0.1]), 1e-5
+        found = np.asarray(jax.jit(jax.jacfwd(after))(torque))
+        steps = change * np.stack([np.eye(2), -np.eye(2)])
+        above, below = np.asarray(jax.jit(jax.vmap(jax.vmap(after)))(torque + steps))
+    expected = (above - below).T / (2 * change)
+    assert np.abs(expected[0]).max() < 0.1 * np.abs(expected[1]).max(), "the first joint is not in its limit"
+    np.testing.assert_allclose(found, expected, rtol=0.02, atol=1e-4)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 from jaxtyping import Array, Float
 from plain_push import PlainPush
+from robot_files import write_robot
 
 from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.observation import HISTORY, ObservationLayout
@@ -149,3 +151,40 @@ def test_layout_names_the_features():
         mujoco.mj_objectVelocity(model, data, mujoco.mjtObj.mjOBJ_SITE, model.site(site).id, velocity, 0)
         np.testing.assert_allclose(features[0, place], data.site(site).xpos, atol=1e-5)
         np.testing.assert_allclose(features[0, speed], velocity[3:], atol=1e-4)
+
+
+FIVE_BAR = """
+<mujoco><compiler angle="radian"/><option timestep="0.01"/><worldbody>
+  <geom type="plane" size="2 2 0.1"/>
+  <body name="ramp" pos="3 0 0"><geom type="box" size="1 1 0.2"/></body>
+  <body name="pedestal" pos="0 0 1"><geom type="box" size="0.1 0.1 0.1" mass="5"/>
+    <body name="left"><joint name="left" axis="0 1 0"/><geom type="sphere" size="0.01" pos="0 0 -0.1" mass="0.2"/>
+      <body name="rod" pos="0 0 -0.3"><joint name="rod" axis="0 1 0"/>
+        <geom type="sphere" size="0.01" pos="0.1 0 0" mass="0.1"/><site name="hand" pos="0.2 0 -0.1"/></body></body>
+  </body>
+  <body name="right" pos="0.4 0 1"><joint name="right" axis="0 1 0"/>
+    <geom type="sphere" size="0.01" pos="0 0 -0.2" mass="0.3"/><site name="elbow" pos="0.05 0 -0.3"/></body>
+  <body name="ball" pos="-2 0 1"><joint name="ball" type="slide" axis="1 0 0"/><geom size="0.1" mass="40"/></body>
+</worldbody>
+<equality><connect body1="rod" body2="right" anchor="0.4 0 0"/></equality>
+<actuator><motor name="m" joint="left" ctrlrange="0 1"/></actuator></mujoco>
+"""
+"""A robot of two kinematic trees that a closed loop connects, beside a ramp and a heavy ball."""
+
+
+def test_robots_of_several_trees_are_observed_without_the_scene(tmp_path: Path):
+    robot = write_robot(tmp_path, "five-bar", FIVE_BAR, tracked="hand", points=["elbow"], commands={"m": "m"})
+    simulator, model = Simulator(robot), robot.load_model()
+    qpos, qvel = np.array([0.3, -0.2, 0.1, 0.5]), np.array([1.0, -2.0, 3.0, -4.0])
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = qpos, qvel
+    mujoco.mj_forward(model, data)
+    features, com = jax.jit(simulator.observe)(state_at(jnp.asarray(qpos, jnp.float32), jnp.asarray(qvel, jnp.float32)))
+
+    layout = ObservationLayout.of(robot)
+    for site, place in (("hand", layout.velocity), ("elbow", layout.point_velocity("elbow"))):
+        jacobian = np.zeros((3, model.nv))
+        mujoco.mj_jacSite(model, data, jacobian, None, model.site(site).id)
+        np.testing.assert_allclose(features[place], jacobian @ qvel, atol=1e-5)
+    bodies = [model.body(name).id for name in ("left", "rod", "right")]
+    np.testing.assert_allclose(com, np.average(data.xipos[bodies], axis=0, weights=model.body_mass[bodies]), atol=1e-6)

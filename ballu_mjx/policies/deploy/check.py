@@ -23,6 +23,7 @@ from ballu_mjx.policies.policy import Policy
 from ballu_mjx.policies.tasks import Step
 from ballu_mjx.residuals.deploy.export import export_simulator, rollout_in_double, rollout_positions
 from ballu_mjx.residuals.deploy.residual import YAW, ImprovedSimulator
+from ballu_mjx.robots.kinematic_trees import mass_shares
 from ballu_mjx.sim.c_model import improved_model, site_poses
 from ballu_mjx.sim.simulator import AugmentedSimulator, Simulator
 
@@ -210,8 +211,8 @@ def check_policy(
         (float(moved[0]), float(moved[1])),
         float(np.rad2deg(rollout.yaw[0, -1])),
     )
-    masses = policy.robot.load_model(policy.actuators).body_mass
-    rest = policy, (qpos[0], qvel[0]), steps, masses
+    shares = mass_shares(policy.robot.load_model(policy.actuators), policy.robot.tracked)
+    rest = policy, (qpos[0], qvel[0]), steps, shares
     seen = []
 
     def act(frames: Frames) -> Any:
@@ -282,10 +283,11 @@ def _run_trial(
     policy: Policy,
     start: tuple[np.ndarray, np.ndarray],
     steps: int,
-    masses: Float[np.ndarray, " bodies"],
+    shares: Float[np.ndarray, " bodies"],
 ) -> Trial:
+    """Return a trial. `shares` are those of `mass_shares`."""
     there.reset(*start)
-    shares, rewards = masses / masses.sum(), []
+    rewards: list[float] = []
     frames = [(0.0, _frame(there))]
     com = first = shares @ there.data.xipos
     stride = max(round(_FRAME_INTERVAL / there.model.opt.timestep), 1)

@@ -66,7 +66,7 @@ def features(model: mujoco.MjModel, data: mujoco.MjData, sites: np.ndarray) -> n
     bodies = model.site_bodyid[sites]
     places = data.site_xpos[sites]
     offset = places - data.subtree_com[model.body_rootid[bodies]]
-    # cvel is the spatial velocity (angular, linear) about the whole robot's centre of mass.
+    # cvel is the spatial velocity (angular, linear) about the centre of mass of the body's kinematic tree.
     velocities = data.cvel[bodies, 3:] + np.cross(data.cvel[bodies, :3], offset)
     kinematics = np.concatenate([places, velocities], axis=1)
     return np.concatenate([kinematics[0], euler_angles(data.xquat[bodies[0]]), kinematics[1:].ravel()])
