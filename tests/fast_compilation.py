@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from importlib.metadata import version
+from ballu_mjx.common import compiler_options
 
-# JAX 0.10 does not have this flag, and XLA refuses unknown flags.
-OLDER_FUSION = "--xla_cpu_use_fusion_emitters=false" if version("jax").startswith("0.9.") else ""
+OLDER_FUSION = " ".join(f"--{name}={str(on).lower()}" for name, on in compiler_options.OLDER_FUSION.items())
 """XLA's older fusion. A control step compiles in 4 s with it, and in 15 s otherwise."""
 ENVIRONMENT = {"XLA_FLAGS": OLDER_FUSION, "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}

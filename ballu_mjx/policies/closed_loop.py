@@ -10,6 +10,8 @@ import numpy as np
 from brax.envs.base import State
 from jaxtyping import Array, Float
 
+from ballu_mjx.common.compiler_options import FOR_ONE_RUN
+from ballu_mjx.policies.domain_randomization import SimulatorSetting, Start, draw_start
 from ballu_mjx.policies.locomotion_env import EnvironmentParameters, LocomotionEnv, locomotion_state
 from ballu_mjx.rl.ppo import Inference, Params
 from ballu_mjx.sim.observation import ObservationLayout
@@ -70,13 +72,13 @@ class ClosedLoop:
         def at(parameters: EnvironmentParameters, qpos: Array, qvel: Array, key: Array) -> State:
             return env.with_parameters(parameters).at(qpos, qvel, key)
 
-        def reset(parameters: EnvironmentParameters, key: Array) -> State:
-            return env.with_parameters(parameters).reset(key)
+        def draw(setting: SimulatorSetting, key: Array) -> Start:
+            return draw_start(setting, env.robot, key)
 
         self._run = jax.jit(jax.vmap(run, in_axes=(None, None, 0)))
-        self._at = jax.jit(jax.vmap(at, in_axes=(None, 0, 0, 0)))
+        self._at = jax.jit(jax.vmap(at, in_axes=(None, 0, 0, 0)), compiler_options=dict(FOR_ONE_RUN))
         self._look = jax.vmap(look)
-        self._reset = jax.jit(jax.vmap(reset, in_axes=(None, 0)))
+        self._draw = jax.jit(jax.vmap(draw, in_axes=(None, 0)))
 
     def __call__(
         self,
@@ -107,6 +109,5 @@ class ClosedLoop:
 
     def standing(self, count: int = 1, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """Return `count` starting states (qpos, qvel), drawn as in training."""
-        state = self._reset(self._parameters, jax.random.split(jax.random.key(seed), count))
-        physics = locomotion_state(state).rollout.physics
-        return np.asarray(physics.qpos), np.asarray(physics.qvel)
+        start = self._draw(self._parameters.setting, jax.random.split(jax.random.key(seed), count))
+        return np.asarray(start.qpos), np.asarray(start.qvel)

@@ -31,6 +31,7 @@ from brax.training.types import Transition, UInt64
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, UInt32
 
+from ballu_mjx.common.compiler_options import FOR_ONE_RUN
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.ppo import Params, PPOConfig, with_mean
 from ballu_mjx.rl.training_env import MEASURED, wrap_for_training
@@ -92,7 +93,7 @@ class Learner:
 
         specs = TrainingState(*[each] * len(TrainingState._fields))._replace(environments=PartitionSpec(_AXIS))
         self._shardings: Any = TrainingState(*(NamedSharding(mesh, spec) for spec in specs))  # pyright: ignore
-        self._first = jax.jit(self._make_first, out_shardings=self._shardings)
+        self._first = jax.jit(self._make_first, out_shardings=self._shardings, compiler_options=dict(FOR_ONE_RUN))
         step = jax.shard_map(
             self._make_step, mesh=mesh, in_specs=(specs, each), out_specs=(specs, each), check_vma=False
         )
