@@ -13,6 +13,7 @@ from ballu_mjx.common.errors import InputError
 from ballu_mjx.residuals.dataset import RecordingsData
 from ballu_mjx.residuals.envmimic import EnvMimicConfig
 from ballu_mjx.residuals.envmimic_training import VALIDATE_EVERY, check_envmimic_options, check_resumes, train_envmimic
+from ballu_mjx.residuals.network_loads import check_load_options
 from ballu_mjx.residuals.network_mirror import network_mirror
 from ballu_mjx.residuals.presets import PresetName, describe_preset, preset_values
 from ballu_mjx.residuals.run_config import run_residual
@@ -22,7 +23,6 @@ from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.runs.folder import read_config
 from ballu_mjx.runs.progress import Progress
 from ballu_mjx.runs.record import TrainingRecord
-from ballu_mjx.sim.force_sets import check_force_set
 from ballu_mjx.viz import artifacts
 
 QUICK: Mapping[str, Any] = {"num_timesteps": 120_000, "num_envs": 256, "batch_size": 128}
@@ -53,10 +53,10 @@ def train(data: Data, env: EnvMimicConfig, ppo: PPOConfig) -> int:
         raise InputError("--preset does not go with --resume, which keeps the run's options; leave out one of them.")
     robot = load_chosen_robot(data.robot, data.resume, "envmimic", data.residual)
     check_envmimic_options(env, ppo, data.validate_every, robot.control_timestep)
-    check_force_set(env.forces, robot)
-    network_mirror(env, robot)
     start = start_from("envmimic", data, ppo)
     check_resumes(start, env, robot)
+    check_load_options(env, robot)
+    network_mirror(env, robot)
     first = distributed.is_first()
     if first and data.preset is not None:
         print(f"--preset {data.preset} sets:\n{describe_preset(data.preset, env, ppo)}\n")

@@ -13,6 +13,7 @@ from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv, check_envmimic_config
 from ballu_mjx.residuals.network import NetworkResidual
 from ballu_mjx.residuals.network_input import num_inputs
+from ballu_mjx.residuals.network_loads import num_loads
 from ballu_mjx.residuals.scales import resolve_scales
 from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.residuals.training_range import with_fading
@@ -100,15 +101,16 @@ def check_envmimic_options(
 
 
 def check_resumes(start: ResumePoint, config: EnvMimicConfig, robot: RobotDescription) -> None:
-    """Check that the policy of a resumed training has the input of these options.
+    """Check that the policy of a resumed training has the input and output of these options.
 
-    **Raises** `InputError` if its number of inputs differs, or if only one of both is symmetric (`--mirror`).
+    **Raises** `InputError` if their number differs, or if only one of both is symmetric (`--mirror`).
     """
     if start.params is None:
         return
-    inputs = start.params.normalizer.mean["state"].shape
-    if inputs != (num_inputs(config, robot),) or (OFFSET in start.params.policy["params"]) != config.mirror:
+    inputs, outputs = start.params.normalizer.mean["state"].shape, ppo.num_actions(start.params.policy)
+    sizes = (*inputs, outputs) == (num_inputs(config, robot), num_loads(config, robot))
+    if not sizes or (OFFSET in start.params.policy["params"]) != config.mirror:
         raise InputError(
-            f"{start.folder}: its policy was trained with another input or another --mirror; leave the options of env "
-            "as they were."
+            f"{start.folder}: its policy was trained with another input, other --forces or another --mirror; leave the "
+            "options of env as they were."
         )

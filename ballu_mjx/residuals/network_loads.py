@@ -12,7 +12,7 @@ from ballu_mjx.common.errors import InputError
 from ballu_mjx.residuals.network_config import ForceNetworkConfig
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim import force_sets
-from ballu_mjx.sim.force_sets import FORCE_SETS
+from ballu_mjx.sim.force_sets import FORCE_SETS, check_force_set
 from ballu_mjx.sim.observation import world_rotation
 
 
@@ -52,22 +52,37 @@ def load_scales(config: ForceNetworkConfig, robot: RobotDescription) -> LoadScal
     return LoadScales(np.array(scales, float), float(force), float(limit / force))
 
 
+def check_load_options(config: ForceNetworkConfig, robot: RobotDescription) -> None:
+    """Check that the force set of a network, its scales and its expected loads fit the robot.
+
+    **Raises** `InputError` if they do not.
+    """
+    check_force_set(config.forces, robot)
+    size, count = num_loads(config, robot), len(config.scales)
+    if count and FORCE_SETS[config.forces].turns:
+        raise InputError(
+            f"--scales is for --forces joints and --forces commands: with --forces {config.forces}, give --force-scale."
+        )
+    if count not in (0, size):
+        raise InputError(
+            f"--scales has {count} values: give {size} with --forces {config.forces}, or leave it out for the default."
+        )
+    expected = len(getattr(config, "expected_loads", ()))
+    if expected not in (0, 1, size):
+        raise InputError(
+            f"--expected-loads has {expected} values: give {size} with --forces {config.forces}, or one for all, or "
+            "leave it out for the default."
+        )
+
+
 def load_units(config: ForceNetworkConfig, robot: RobotDescription) -> Float[np.ndarray, " loads"]:
     """Return the load for one unit of each output (N, N m, commands' units)."""
     return load_scales(config, robot).units
 
 
 def expected_units(config: ForceNetworkConfig, robot: RobotDescription) -> Float[np.ndarray, " loads"]:
-    """Return the expected loads of EnvMimic's options, as outputs of the network.
-
-    **Raises** `InputError` if their number is neither 1 nor that of the loads.
-    """
+    """Return the expected loads of EnvMimic's options, as outputs of the network."""
     expected, units = getattr(config, "expected_loads", ()) or (0.0,), load_units(config, robot)
-    if len(expected) not in (1, len(units)):
-        raise InputError(
-            f"--expected-loads has {len(expected)} values: give {len(units)} with --forces {config.forces}, or one "
-            "for all, or leave it out for the default."
-        )
     return np.broadcast_to(np.asarray(expected, float), units.shape) / units
 
 

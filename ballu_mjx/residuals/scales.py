@@ -32,10 +32,10 @@ from ballu_mjx.identification.actuator_choice import physics_commands
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import ReferenceMotions, stack_motions
 from ballu_mjx.residuals.network_config import ForceNetworkConfig
-from ballu_mjx.residuals.network_loads import load_scales
+from ballu_mjx.residuals.network_loads import check_load_options, load_scales
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.c_model import improved_model
-from ballu_mjx.sim.force_sets import FORCE_SETS, ForceSet, check_force_set, num_loads
+from ballu_mjx.sim.force_sets import FORCE_SETS, ForceSet
 from ballu_mjx.sim.observation import HISTORY, ObservationLayout, commands_seen
 from ballu_mjx.sim.residual import BoundResidual
 from ballu_mjx.sim.simulator import AugmentedSimulator, Simulator
@@ -69,15 +69,15 @@ def resolve_scales(config: Config, simulator: Simulator | AugmentedSimulator, mo
     Values that are given stay. The others are derived from the loads that `simulator`, with its base residual, leaves
     unexplained in `motions`.
 
-    **Raises** `InputError` if the robot has nothing on which the force set can act.
+    **Raises** `InputError` if the robot has nothing on which the force set can act, or if given values do not fit it.
     """
     augmented = simulator.with_residual(None)
     robot, forces = augmented.robot, config.forces
-    check_force_set(forces, robot)
+    check_load_options(config, robot)
     vectors = FORCE_SETS[forces].turns
     open_force = vectors and config.force_scale is None
     open_torque = forces == "wrench" and config.torque_scale is None
-    open_scales = not vectors and len(config.scales) != num_loads(forces, robot)
+    open_scales = not vectors and not config.scales
     open_mean = getattr(config, "expected_loads", None) == ()
     found: dict[str, Any] = {}
     if open_force or open_torque or open_scales or open_mean:

@@ -299,6 +299,12 @@ def with_mean(policy: Mapping[str, Any], mean: Float[Array | np.ndarray, " actio
     return {**policy, "params": {**layers, _MEAN: {**last, "bias": last["bias"] + mean}}}
 
 
+def num_actions(policy: Mapping[str, Any]) -> int:
+    """Return the number of actions of a policy network."""
+    layers = policy["params"]
+    return len(layers[OFFSET] if OFFSET in layers else layers[_MEAN]["bias"])
+
+
 _MEAN = "Dense_0"
 """Brax's name of the layer whose output is the mean of the action distribution."""
 

@@ -15,7 +15,7 @@ from ballu_mjx.rl import ppo, training_state
 from ballu_mjx.rl.learner import Learner
 from ballu_mjx.rl.ppo import Params, PPOConfig
 from ballu_mjx.rl.training_state import TrainingState
-from ballu_mjx.runs.checkpoints import Checkpoint, last_checkpoint, list_checkpoints
+from ballu_mjx.runs.checkpoints import SCORED_WITH, Checkpoint, last_checkpoint, list_checkpoints
 from ballu_mjx.runs.folder import read_config, typed_config
 from ballu_mjx.runs.metrics import read_metrics
 from ballu_mjx.runs.rollout_file import ROLLOUT_FILE
@@ -130,15 +130,19 @@ def find_resume_point(
 
 
 def training_facts(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the parts of a run's `config.json` on which a training state depends, apart from its shapes.
+    """Return the parts of a run's `config.json` on which a training state and a score depend, apart from shapes.
 
     They are saved with every checkpoint, because a later start may overwrite `config.json`.
     """
-    recordings = [entry["sha256"] for entry in config.get("recordings", {}).get("training", [])]
-    parts = {name: config.get(name) for name in ("env", "actuators", "residual")} | {"recordings": recordings}
-    text = json.dumps(parts, sort_keys=True, default=str)
+
+    def digest(use: str) -> str:
+        recordings = [entry["sha256"] for entry in config.get("recordings", {}).get(use, [])]
+        parts = {name: config.get(name) for name in ("env", "actuators", "residual")} | {"recordings": recordings}
+        return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()
+
     return {
         "learning_rate": config["ppo"]["learning_rate"],
         "seed": config["ppo"]["seed"],
-        "environments": hashlib.sha256(text.encode()).hexdigest(),
+        "environments": digest("training"),
+        SCORED_WITH: digest("validation"),
     }

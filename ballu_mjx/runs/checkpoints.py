@@ -11,7 +11,7 @@ import logging
 import shutil
 import sys
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, TextIO
 
@@ -27,6 +27,9 @@ from ballu_mjx.runs.layout import CHECKPOINTS_FOLDER, CHECKPOINTS_KEPT, PARAMS_F
 _LOG = logging.getLogger(__name__)
 CHECKPOINT_OVERHEAD = 2**20
 """Upper bound of a checkpoint's size without its arrays (bytes)."""
+
+SCORED_WITH = "scored_with"
+"""Note of a checkpoint: hash of the options and recordings on which its score depends. Resumed runs may have others."""
 
 Which = Literal["best", "last"] | int
 
@@ -44,7 +47,8 @@ class Checkpoint:
 def restore_checkpoint(folder: Path, which: Which) -> tuple[int, dict[str, Any]]:
     """Return step and parameters of a run's checkpoint: the best, the last, or that of a given step.
 
-    If the last checkpoint is damaged, the one before is read, and the terminal shows a warning.
+    If the last checkpoint is damaged, the one before is read, and the terminal shows a warning. The best is chosen
+    among the checkpoints whose scores have the same conditions (`SCORED_WITH`) as the last score.
 
     **Raises** `InputError` if there is no checkpoint, or if the requested one is damaged.
     """
@@ -53,15 +57,23 @@ def restore_checkpoint(folder: Path, which: Which) -> tuple[int, dict[str, Any]]
         return checkpoint.step, checkpoint.params
     steps = list_checkpoints(folder)
     try:
-        scores = {step: _record(folder, step)["score"] for step in steps} if which == "best" else {}
-        scored = {step: score for step, score in scores.items() if score is not None}
-        step = min(scored, key=lambda step: (scored[step], -step), default=None) if which == "best" else which
+        step = _best_step(folder, steps) if which == "best" else which
         if step not in steps:
             raise _no_checkpoint(folder, "validated checkpoint" if which == "best" else "checkpoint")
         return step, _read(folder, step, training=False).params
     except _DamagedError as error:
         fix = "restore it from a copy, or delete its folder to use the next best"
         raise InputError(f"{error}; {fix}.") from error
+
+
+def _best_step(folder: Path, steps: Sequence[int]) -> int | None:
+    records = {step: _record(folder, step) for step in steps}
+    scored = {step: record for step, record in records.items() if record["score"] is not None}
+    if not scored:
+        return None
+    conditions = scored[max(scored)]["notes"].get(SCORED_WITH)
+    alike = [step for step, record in scored.items() if record["notes"].get(SCORED_WITH) == conditions]
+    return min(alike, key=lambda step: (scored[step]["score"], -step))
 
 
 def last_checkpoint(folder: Path, *, training: bool = False) -> Checkpoint:

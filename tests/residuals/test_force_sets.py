@@ -23,7 +23,7 @@ from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv, tracking_s
 from ballu_mjx.residuals.force_regression import SupervisedConfig
 from ballu_mjx.residuals.network import NetworkResidual
 from ballu_mjx.residuals.network_config import ForceNetworkConfig
-from ballu_mjx.residuals.network_loads import expected_units, load_scales, num_loads
+from ballu_mjx.residuals.network_loads import check_load_options, expected_units, load_scales, num_loads
 from ballu_mjx.residuals.scales import missing_loads, resolve_scales, round_scale
 from ballu_mjx.robots.description import RobotDescription, read_description
 from ballu_mjx.sim.force_sets import ForceSet
@@ -164,8 +164,23 @@ def test_expected_loads_are_one_for_all_or_one_for_each(robot: RobotDescription)
     for given, units in (((), [0, 0]), ((1.0,), [2, 0.5]), ((1.0, -2.0), [2, -1])):
         found = expected_units(dataclasses.replace(config, expected_loads=given), robot)
         np.testing.assert_allclose(found, units)
-    with pytest.raises(InputError, match="--expected-loads has 3 values: give 2 with --forces joints"):
-        expected_units(dataclasses.replace(config, expected_loads=(1.0, 2.0, 3.0)), robot)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"expected_loads": (1.0, 2.0, 3.0)}, "--expected-loads has 3 values: give 2 with --forces joints"),
+        ({"scales": (0.5,)}, "--scales has 1 values: give 2 with --forces joints"),
+        ({"forces": "wrench"}, "with --forces wrench, give --force-scale"),
+    ],
+)
+def test_scales_and_expected_loads_that_do_not_fit_the_robot_are_refused(
+    robot: RobotDescription, changes: dict[str, Any], message: str
+):
+    config = EnvMimicConfig(forces="joints", scales=(0.5, 2.0))
+    check_load_options(config, robot)
+    with pytest.raises(InputError, match=message):
+        resolve_scales(dataclasses.replace(config, **changes), Simulator(robot), [])
 
 
 @pytest.mark.parametrize(

@@ -120,3 +120,5 @@ def test_a_resumed_training_keeps_its_symmetry():
     check_resumes(start, EnvMimicConfig("force", mirror=True), BALLU)
     with pytest.raises(InputError, match="runs/earlier: .*another --mirror"):
         check_resumes(start, EnvMimicConfig("force"), BALLU)
+    with pytest.raises(InputError, match="runs/earlier: .*other --forces"):
+        check_resumes(start, EnvMimicConfig("wrench", mirror=True), BALLU)

@@ -205,6 +205,16 @@ def test_changed_options_reset_the_environments_of_a_resumed_run(tmp_path, small
     assert again[goal].shape == stored[goal].shape and not np.array_equal(again[goal], stored[goal])
 
 
+def test_the_best_checkpoint_of_a_resumed_run_was_scored_with_its_options(tmp_path):
+    folder, params = tmp_path / "run", {"weight": np.zeros(1)}
+    for options, scores in (({"force_scale": 0.05}, {0: 0.5, 10: 0.6}), ({"force_scale": 0.5}, {20: 0.9, 30: 0.8})):
+        config = content(env=options)
+        with Run(folder, config, resumed_at=10 if 20 in scores else None) as run:
+            for step, score in scores.items():
+                run.save(step, params, score, notes=training_facts(config))
+            assert run.best()[0] == min(scores, key=lambda step: scores[step])
+
+
 def test_a_run_of_an_older_version_resumes_from_its_parameters(tmp_path, small):
     before = small.init(5)
     folder = tmp_path / "run"
