@@ -70,15 +70,18 @@ position = ["tip_pos[0]", "tip_pos[1]", "tip_pos[2]"]
 # ---- the formats ----
 
 
-def rows(columns: list[np.ndarray], delimiter: str, decimals: int, *, lost: list[int], first: str = "") -> str:
-    """Return rows of numbers as text. The cells of the columns `lost` are empty in the hidden samples."""
+def rows(columns: list[np.ndarray], delimiter: str, decimals: int, *, lost: list[int], first: int | None = None) -> str:
+    """Return rows of numbers as text. The cells of the columns `lost` are empty in the hidden samples.
+
+    `first`: number of the first frame. None if the rows do not begin with frames.
+    """
     lines = []
     for i, row in enumerate(np.column_stack(columns)):
         cells = [f"{x:.{decimals}f}" for x in row]
         if HIDDEN.start <= i < HIDDEN.stop:
             for column in lost:
                 cells[column] = ""
-        lines.append(delimiter.join(([f"{i}"] if first else []) + cells))
+        lines.append(delimiter.join(([] if first is None else [f"{first + i}"]) + cells))
     return "\n".join(lines) + "\n"
 
 
@@ -103,7 +106,7 @@ def write_motive(folder: Path, version: str = "1.23", unit: str = "Meters") -> P
         heads = [["", "", *cells] for _, _, *cells in heads[:-1]] + [["Frame", "Time", *axes]]
     place, tip = scale * HULL.place @ Y_UP, scale * TIP.place @ Y_UP
     columns = [TIME, *hull.as_quat().T, *place.T, np.full(SAMPLES, 3e-4), *(place + 1).T, *tip.T]
-    body = rows(columns, ",", 6, lost=[*range(1, 9)], first="frame")
+    body = rows(columns, ",", 6, lost=[*range(1, 9)], first=0)
     path = folder / "take.csv"
     path.write_text("\n".join([top, "", *(",".join(row) for row in heads)]) + "\n" + body)
     return path
@@ -152,7 +155,7 @@ def write_qualisys_markers(folder: Path) -> Path:
     names = [*CORNERS, "tip"]
     places = [HULL.place + HULL.turn.apply(corner) for corner in CORNERS.values()] + [TIP.place]
     header = "\t".join(["Frame", "Time", *(f"{name} {axis}" for name in names for axis in "XYZ")])
-    body = rows([TIME, *(1e3 * np.hstack(places).T)], "\t", 3, lost=[*range(1, 7)], first="frame")
+    body = rows([TIME, *(1e3 * np.hstack(places).T)], "\t", 3, lost=[*range(1, 7)], first=1)
     path = folder / "trial.tsv"
     path.write_text(qualisys_header("3D", names) + header + "\n" + body)
     return path

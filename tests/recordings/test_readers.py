@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import sys
 import typing
@@ -42,7 +43,7 @@ from scipy.spatial.transform import Rotation
 from ballu_mjx.cli import record
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.csv_format import read_recording
-from ballu_mjx.recordings.importers.mapping import RoomMapping, read_mapping
+from ballu_mjx.recordings.importers.mapping import Clock, RoomMapping, read_mapping
 from ballu_mjx.recordings.importers.readers import READERS, find_reader, read_capture
 from ballu_mjx.recordings.importers.table import Table
 from ballu_mjx.recordings.recording import Recording
@@ -779,3 +780,48 @@ def test_map_includes_the_orientation_of_an_oriented_point(tmp_path: Path):
     run("map", tmp_path / "x.csv", "--output", tmp_path / "room.toml")
     text = (tmp_path / "room.toml").read_text()
     assert 'orientation = ["base_qw", "base_qx", "base_qy", "base_qz"]' in text
+
+
+@pytest.mark.parametrize("write", [write_motive, write_qualisys_bodies])
+@pytest.mark.parametrize("given", [False, True])
+def test_times_of_a_cropped_take_count_from_its_start(
+    tmp_path: Path, robot: RobotDescription, write: Callable[[Path], Path], given: bool
+):
+    """So they do if the mapping gives the rate."""
+    path, missing = write(tmp_path), 50
+    lines = path.read_text().splitlines(keepends=True)
+    head = len(lines) - SAMPLES
+    text = "".join(lines[:head] + lines[head + missing :])
+    path.write_text(text.replace(f"NO_OF_FRAMES\t{SAMPLES}", f"NO_OF_FRAMES\t{SAMPLES - missing}"))
+    mapping = room(tmp_path, robot, NAMED, commands=NO_COMMANDS)
+    found = read_capture(path, dataclasses.replace(mapping, rate=RATE if given else None))
+    np.testing.assert_allclose(found.time, TIME[missing:], atol=2e-6)
+    assert found.first_frame == missing + 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [({"rate": 200.0}, "rate: .*a time for each"), ({"clock": Clock(time_unit="ms")}, "time_unit")],
+)
+def test_keys_that_do_not_apply_to_a_format_are_refused(
+    tmp_path: Path, robot: RobotDescription, changes: dict[str, Any], message: str
+):
+    mapping = dataclasses.replace(room(tmp_path, robot, NAMED, commands=NO_COMMANDS), **changes)
+    path = tmp_path / "poses.txt"
+    path.write_text("# timestamp tx ty tz qx qy qz qw\n" + "".join(f"{i} 0 0 1 0 0 0 1\n" for i in range(9)))
+    with pytest.raises(InputError, match=message):
+        read_capture(path, mapping)
+
+
+def test_the_rate_of_the_mapping_replaces_the_times_of_a_table(tmp_path: Path, robot: RobotDescription):
+    text = """[units]
+length = "m"
+[hull]
+position = ["hull_x", "hull_y", "hull_z"]
+orientation = ["hull_qw", "hull_qx", "hull_qy", "hull_qz"]
+rotation = "quaternion"
+[tip]
+position = ["tip_x", "tip_y", "tip_z"]
+"""
+    mapping = room(tmp_path, robot, text, commands=NO_COMMANDS, rate=50.0)
+    np.testing.assert_allclose(read_capture(write_table(tmp_path), mapping).time, np.arange(SAMPLES) / 50.0)

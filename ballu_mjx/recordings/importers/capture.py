@@ -109,6 +109,8 @@ class Capture:
     """Sentences about parts of the file that are not read, and about uncertain properties."""
     episodes: Sequence[int] = ()
     """Numbers of the episodes, if a mapping must select one. This capture holds the first."""
+    first_frame: int = 1
+    """Number of the first frame in its trial, counted from 1; see `Trajectories`."""
 
 
 def list_capture(capture: Capture) -> Contents:
@@ -196,7 +198,7 @@ def select(capture: Capture, mapping: RoomMapping) -> Trajectories:
     commands = None
     if any(_find_column(capture, name) is not None for name in mapping.commands.columns.values()):
         commands = CommandLog(*_commands(capture, mapping.commands, mapping, log=False))
-    return Trajectories(capture.path, time, bodies, angles, commands)
+    return Trajectories(capture.path, time, bodies, angles, commands, capture.first_frame)
 
 
 def read_commands(
@@ -308,13 +310,13 @@ def _column(capture: Capture, mapping: RoomMapping, name: str) -> tuple[np.ndarr
 
 
 def _rows_clock(capture: Capture, mapping: RoomMapping) -> np.ndarray:
-    """Return the times (s) of a file's rows: from its time column, or else from the mapping's rate."""
+    """Return the times (s) of a file's rows: from the mapping's rate, or else from its time column."""
+    if mapping.rate is not None:
+        return np.arange(capture.rows) / mapping.rate
     name = mapping.clock.time or capture.time_column or mapping.commands.time
     column = _find_column(capture, name)
     if capture.clock is not None and column is not None:
         return capture.clock(column, mapping.clock.time_unit)
-    if mapping.rate is not None:
-        return np.arange(capture.rows) / mapping.rate
     fix = f'write time = "..." under [clock] in {mapping.path}, {suggest(name, capture.columns)}'.rstrip("?")
     refuse(capture.path, "", f"there is no column {shorten(name)!r} of times", f"{fix}; or rate = ... (Hz)")
 

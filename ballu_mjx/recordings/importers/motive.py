@@ -79,7 +79,7 @@ def open_motive(path: Path, mapping: RoomMapping | None) -> Capture:
         time = table[:, 1]
         check_times(path, time, header + 1, "export again, one take per file")
     else:
-        time = (frame - frame[0]) / rate
+        time = frame / rate  # Frame 0 is the start of the take, also in a file that is cropped.
     unit = _length(path, _value(top, "Length Units"), mapping)
     rotation = _value(top, "Rotation Type")
     local = _value(top, "Coordinate Space").lower() == "local"
@@ -132,7 +132,7 @@ def open_motive(path: Path, mapping: RoomMapping | None) -> Capture:
     expected = [name for (kind, name), _ in groups.items() if kind in _EXPECTED and name not in bodies]
     if expected:
         notes.append(f"Expected positions of markers are not measurements and are not read: {_first_of(expected)}.")
-    return Capture(path, _PROGRAM, bodies, notes=notes)
+    return Capture(path, _PROGRAM, bodies, notes=notes, first_frame=int(frame[0]) + 1 if len(frame) else 1)
 
 
 def _first_of(names: Sequence[str]) -> str:

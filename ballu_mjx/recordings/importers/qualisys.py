@@ -82,15 +82,16 @@ def open_qualisys(path: Path, mapping: RoomMapping | None) -> Capture:
     if len(table) < stated:
         problem = f"holds {len(table)} of the {stated:g} frames that its header states"
         refuse(path, "", problem, "the file was cut off; copy or export it again")
+    frame = 1.0 + np.arange(len(table))
     if "Frame" in leading:
-        check_times(path, table[:, leading.index("Frame")], samples, "export again, one capture per file")
+        frame = table[:, leading.index("Frame")]
+        check_times(path, frame, samples, "export again, one capture per file")
     if "Time" in leading and (mapping is None or mapping.rate is None):
         time = table[:, leading.index("Time")]
         check_times(path, time, samples, "export again, or write rate = ... in the mapping")
     else:
         rate = _rate(path, places.get("FREQUENCY", 1), keys.get("FREQUENCY", [""])[0], mapping)
-        counted = table[:, leading.index("Frame")] if "Frame" in leading else np.arange(len(table))
-        time = (counted - counted[0]) / rate
+        time = (frame - 1) / rate
     unit = LENGTHS["mm"] if mapping is None or mapping.length is None else LENGTHS[mapping.length]
     index = {name: i for i, name in enumerate(columns)}
     bodies = {
@@ -100,7 +101,7 @@ def open_qualisys(path: Path, mapping: RoomMapping | None) -> Capture:
         for name in names
     }
     notes = [] if "Time" in leading else ["Times are computed from FREQUENCY, because there is no time column."]
-    return Capture(path, _PROGRAM, bodies, notes=notes)
+    return Capture(path, _PROGRAM, bodies, notes=notes, first_frame=int(frame[0]) if len(frame) else 1)
 
 
 def _columns(

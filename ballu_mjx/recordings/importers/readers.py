@@ -45,28 +45,38 @@ class Reader:
     """Function that reads the whole file. None if the format has no such function."""
     clock: bool = False
     """Whether the table [clock] of a mapping applies to this format."""
+    rate: bool = True
+    """Whether the rate of a mapping applies to this format."""
 
 
 def _reader(
-    name: str, program: str, recognise: Callable[[Path, str], bool], open_file: Opener, *, clock: bool = False
+    name: str,
+    program: str,
+    recognise: Callable[[Path, str], bool],
+    open_file: Opener,
+    *,
+    clock: bool = False,
+    rate: bool = True,
 ) -> Reader:
     def read(path: Path, mapping: RoomMapping) -> Trajectories:
         return select(open_file(path, mapping), mapping)
 
-    return Reader(name, program, recognise, read, lambda path: list_capture(open_file(path, None)), open_file, clock)
+    return Reader(
+        name, program, recognise, read, lambda path: list_capture(open_file(path, None)), open_file, clock, rate
+    )
 
 
 READERS: Mapping[str, Reader] = {
     reader.name: reader
     for reader in (
-        _reader("lerobot", "LeRobot dataset", recognise_lerobot, open_lerobot, clock=True),
-        _reader("bag", "ROS bag or MCAP", recognise_bag, open_bag, clock=True),
+        _reader("lerobot", "LeRobot dataset", recognise_lerobot, open_lerobot, clock=True, rate=False),
+        _reader("bag", "ROS bag or MCAP", recognise_bag, open_bag, clock=True, rate=False),
         _reader("npz", "NumPy archive", recognise_npz, open_npz, clock=True),
         Reader("c3d", "C3D", recognise_c3d, read_c3d, list_c3d),
         _reader("motive", "OptiTrack Motive CSV", recognise_motive, open_motive),
         _reader("qualisys", "Qualisys TSV", recognise_qualisys, open_qualisys),
-        _reader("euroc", "EuRoC CSV", recognise_euroc, open_euroc),
-        _reader("tum", "TUM trajectory", recognise_tum, open_tum),
+        _reader("euroc", "EuRoC CSV", recognise_euroc, open_euroc, rate=False),
+        _reader("tum", "TUM trajectory", recognise_tum, open_tum, rate=False),
         Reader("vicon", "Vicon CSV", recognise_vicon, read_vicon, list_vicon),
         _reader("table", "table", lambda path, start: True, lambda path, mapping: open_table(path), clock=True),
     )
@@ -107,6 +117,12 @@ def read_capture(path: Path, mapping: RoomMapping, name: str | None = None) -> T
     if not reader.clock and (clock.time is not None or clock.episode is not None):
         problem = f"{path.name} is read as a {reader.program}, which has only one clock"
         refuse(mapping.path, "[clock]", problem, "leave it out")
+    if not reader.clock and clock.time_unit != "s":
+        problem = f"{path.name} is read as a {reader.program}, whose format fixes the unit of times"
+        refuse(mapping.path, "[clock] time_unit", problem, "leave it out")
+    if not reader.rate and mapping.rate is not None:
+        problem = f"{path.name} is read as a {reader.program}, which has a time for each sample"
+        refuse(mapping.path, "rate", problem, "leave it out")
     if clock.episode is not None and reader.name != "lerobot":
         refuse(mapping.path, "[clock] episode", f"{path.name} is not a LeRobot dataset", "leave it out")
     return reader.read(path, mapping)
