@@ -25,8 +25,8 @@ _LAST = 0.1
 _POINTS = 200
 """Number of points of a drawn learning curve."""
 _UNTOLD = ("seed", "num_timesteps")
-"""Options in which the runs of a row may differ. A run counts with the steps that it has done, not with the number of
-steps that it was given."""
+"""Options that do not distinguish rows. A run counts with the steps that it has done, not with the number of steps that
+it was given."""
 
 
 _MEAN_RATIO = "mean ratio"
@@ -69,7 +69,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def rows(folders: Sequence[Path]) -> list[Row]:
-    """Return the runs grouped into rows, one for each set of options.
+    """Return the runs grouped into rows, one for each set of options and number of steps.
+
+    A run with the seed of an earlier run of its row has a row of its own.
 
     **Raises** `InputError` if a folder is no run, is given twice, or has another task.
     """
@@ -86,12 +88,17 @@ def rows(folders: Sequence[Path]) -> list[Row]:
                 f"{folder}: is a run of {config['task']!r}, {folders[0]} one of {configs[0]['task']!r}; compare runs "
                 "of one task."
             )
-    options = [_options(config) for config in configs]
+    options = [_options(config) | _steps(folder) for folder, config in zip(folders, configs, strict=True)]
     names = [name for name in options[0] if all(name in each for each in options)]
     differing = [name for name in names if len({each.get(name) for each in options}) > 1]
     found: dict[str, list[Path]] = {}
-    for folder, each in zip(folders, options, strict=True):
+    seeds: dict[str, set[Any]] = {}
+    for folder, config, each in zip(folders, configs, options, strict=True):
         label = ", ".join(f"{name} {each[name]}" for name in differing) or configs[0]["task"]
+        seed = next((config[section]["seed"] for section in ("ppo", "fit") if "seed" in config.get(section, {})), None)
+        if seed in seeds.setdefault(label, set()):
+            label = f"{label} ({folder})"  # a repeated run is no other sample
+        seeds.setdefault(label, set()).add(seed)
         found.setdefault(label, []).append(folder)
     return [Row(label, tuple(members)) for label, members in found.items()]
 
@@ -225,6 +232,14 @@ def _options(config: Mapping[str, Any]) -> dict[str, str]:
         found[f"{use} recordings"] = _digest([file["sha256"] for file in files])
     found["residual"] = config.get("residual") or "none"
     return found
+
+
+def _steps(folder: Path) -> dict[str, str]:
+    """Return the number of control steps that a run has trained for, if it has trained."""
+    from ballu_mjx.runs.metrics import read_column
+
+    steps, _ = read_column(folder, "reward")
+    return {"steps": f"{int(steps[-1]):,}"} if len(steps) else {}
 
 
 def _kind(config: Mapping[str, Any]) -> str:

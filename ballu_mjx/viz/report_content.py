@@ -229,7 +229,7 @@ def _add_identification(content: Content, folder: Path) -> None:
 
 def _horizons(title: str, names: tuple[str, str], without: Errors, mimic: Errors, angle: str) -> Table:
     """Return the table of a recording's errors by horizon: means over starts without and with residual, and ratios."""
-    from ballu_mjx.evaluation.errors import quotient
+    from ballu_mjx.evaluation.errors import error_ratio
 
     header = ["horizon (s)"]
     shown = [each for each in _QUANTITIES if getattr(without, each[0])]
@@ -244,7 +244,8 @@ def _horizons(title: str, names: tuple[str, str], without: Errors, mimic: Errors
                 row += [Cell("")] * 3
                 continue
             one, other = getattr(without, key)[horizon][0], getattr(mimic, key)[horizon][0]
-            row += [_cell(one, digits), _cell(other, digits), _cell(quotient(other, one), 2)]
+            ratio = error_ratio((mimic,), (without,), without.group, key, horizon)
+            row += [_cell(one, digits), _cell(other, digits), _cell(ratio, 2)]
         rows.append(row)
     return Table(title, header, rows)
 

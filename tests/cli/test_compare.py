@@ -74,6 +74,15 @@ def test_compare_writes_a_table_and_a_plot(folders: list[Path], tmp_path: Path, 
     assert (tmp_path / "out" / "compare.png").stat().st_size > 10_000
 
 
+def test_only_runs_of_equal_length_and_different_seeds_share_a_row(folders: list[Path], tmp_path: Path):
+    again = write(tmp_path / "again", 0, 0.05, 1.3)
+    assert [row.label for row in compare.rows([folders[0], again])] == ["envmimic", f"envmimic ({again})"]
+    longer = write(tmp_path / "longer", 3, 0.05, 1.3)
+    with (longer / "metrics.jsonl").open("a") as metrics:
+        metrics.write(json.dumps({"step": 500, "reward": 1.4}) + "\n")
+    assert [row.label for row in compare.rows([*folders[:3], longer])] == ["steps 100", "steps 500"]
+
+
 def test_a_single_run_has_no_interval(folders: list[Path], capsys: pytest.CaptureFixture[str]):
     assert compare.main([str(folders[0])]) == 0
     out = capsys.readouterr().out
