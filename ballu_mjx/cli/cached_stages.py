@@ -19,6 +19,8 @@ from ballu_mjx.common.errors import InputError
 from ballu_mjx.runs.checkpoints import list_checkpoints
 
 _KEY = re.compile("[0-9a-f]{16}")
+SET_ASIDE = re.compile(r"\.[0-9a-f]{16}$")
+"""End of the names of folders that were made with other options and renamed."""
 
 
 def cached_stage(
@@ -29,7 +31,10 @@ def cached_stage(
     The key is a hash of `options` and of the keys of the stages `needs`. A folder with another key is renamed and kept.
     If a folder with the same key is unfinished, `make` continues in it if `goes_on` is true and it has checkpoints.
     Otherwise the folder is emptied first.
+
+    **Raises** `InputError` from `check_is_stage`.
     """
+    check_is_stage(folder)
     content = {
         "options": options if isinstance(options, dict) else plain(options),
         "needs": [read_mark(stage_mark(need))["key"] for need in needs],
@@ -48,7 +53,7 @@ def cached_stage(
         found = None
     print(f"\n== {folder.name}" + (" (resumed)" if goes_on and found is not None else ""), flush=True)
     if folder.exists() and not (goes_on and found is not None and list_checkpoints(folder)):
-        shutil.rmtree(folder)  # unfinished, and `make` cannot continue in it
+        shutil.rmtree(folder)  # unfinished (or empty), and `make` cannot continue in it
     folder.mkdir(parents=True, exist_ok=True)
     write_mark(mark, key, content, done=False)
     make(folder)
@@ -57,6 +62,15 @@ def cached_stage(
     jax.clear_caches()
     gc.collect()
     return folder
+
+
+def check_is_stage(folder: Path) -> None:
+    """Check that a stage's folder is missing, is empty, or was made by this module.
+
+    **Raises** `InputError` otherwise. The content of such a folder is the user's.
+    """
+    if folder.exists() and not stage_mark(folder).exists() and not (folder.is_dir() and not any(folder.iterdir())):
+        raise InputError(f"{folder}: was not made by `train all`; move it, or give another --output.")
 
 
 def stage_mark(folder: Path) -> Path:

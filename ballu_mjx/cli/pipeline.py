@@ -35,7 +35,7 @@ from ballu_mjx.ballu.virtual.robot import CaptureController, open_loop
 from ballu_mjx.ballu.virtual.trials import ExportedPolicy, run_trials
 from ballu_mjx.cli import train_aerodynamics, train_envmimic, train_forces, train_policy, train_sysid
 from ballu_mjx.cli._command import TrainCommand, written_to
-from ballu_mjx.cli.cached_stages import cached_stage
+from ballu_mjx.cli.cached_stages import SET_ASIDE, cached_stage, check_is_stage
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.common.results import Cell, Table
@@ -457,6 +457,10 @@ def _check(options: Options) -> None:
     if options.output.exists() and not options.output.is_dir():
         raise InputError(f"{options.output}: is a file; give --output a folder.")
     files.check_folder(options.output)
+    own = [each for seed in options.seeds for each in (options.output / f"seed-{seed}").glob("*")]
+    for stage in (options.output / "sweep", options.output / "sysid", *own):
+        if stage.is_dir() and not SET_ASIDE.search(stage.name):
+            check_is_stage(stage)
 
 
 COMMAND = TrainCommand(

@@ -57,6 +57,17 @@ def test_changed_option_remakes_dependent_stages_and_keeps_the_old_ones(tmp_path
     assert [(path / "result").read_text() for path in renamed] == ["2"]
 
 
+def test_folders_of_the_user_are_neither_used_nor_removed(tmp_path):
+    own = tmp_path / "out" / "seed-0" / "walk-vanilla+dr" / "notes.txt"
+    own.parent.mkdir(parents=True)
+    own.write_text("mine")
+    with pytest.raises(InputError, match="was not made by `train all`"):
+        pipeline.run(Options(output=tmp_path / "out"))
+    with pytest.raises(InputError, match="was not made by `train all`"):
+        cached_stage(own.parent, {}, [], lambda folder: None)
+    assert own.read_text() == "mine"
+
+
 def test_unfinished_stages_are_made_again(tmp_path):
     run_stages(tmp_path, {"a": 1, "b": 2, "c": 3})
     mark = tmp_path / "b.stage.json"
