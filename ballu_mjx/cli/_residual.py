@@ -79,6 +79,7 @@ def train_residual(
     show: Callable[[Path, TrainedResidual], None],
     *,
     base: Path | None = None,
+    earlier: Path | None = None,
     start: ResumePoint | None = None,
     first: bool = True,
 ) -> int:
@@ -89,13 +90,13 @@ def train_residual(
     - `sections`: function that returns the options for `config.json`, with values that depend on the recordings set.
     - `learn`: function that learns the residual.
     - `show`: function that takes the run's folder and the residual. It is called before the evaluation is printed.
-    - `base`, `first`: see `prepare`.
+    - `base`, `earlier`, `first`: see `prepare`.
     - `start`: point from which training resumes. None to start a new training.
     """
     start = start or ResumePoint()
     loggers.check(data.wandb)
     with written_to(first=first) as written:
-        prepared = prepare(task, data, base, start.folder, first=first)
+        prepared = prepare(task, data, base, start.folder, earlier=earlier, first=first)
         folder = written.folder = prepared.folder
         content = prepared.describe(sections(prepared))
         with open_run(folder, content, start.resumed_at, data.wandb, first=first) as run:
@@ -124,7 +125,13 @@ def show_report(folder: Path, residual: TrainedResidual) -> None:
 
 
 def prepare(
-    task: str, data: RecordingsData, base: Path | None = None, resume: Path | None = None, *, first: bool = True
+    task: str,
+    data: RecordingsData,
+    base: Path | None = None,
+    resume: Path | None = None,
+    *,
+    earlier: Path | None = None,
+    first: bool = True,
 ) -> Prepared:
     """Read and check all inputs of residual learning, and print the use of each.
 
@@ -132,17 +139,21 @@ def prepare(
 
     - `base`: run folder of a residual that acts beside the one to be learned. None if there is none.
     - `resume`: run folder to resume. None for a new run.
+    - `earlier`: run folder of a residual from which values are taken. None if there is none. Like the base residual, it
+      needs its own robot and actuators.
     - `first`: whether this process writes and prints.
 
     **Raises** `InputError` for recordings, actuators or a base residual that cannot be used. The message names them.
     """
-    robot = load_chosen_robot(data.robot, resume, task, base)
+    robot = load_chosen_robot(data.robot, resume, task, base or earlier)
     residual = None if base is None else TrainedResidual.load(base, robot)
     dataset = ResidualDataset.read(data, robot, resume)
-    if residual is not None:
-        if dataset.undecided:
-            dataset = dataset.with_actuators(residual.actuators, f"those of {base}")
-        dataset.check_base_residual(residual.actuators, base)
+    for run in (base, earlier):
+        if run is not None:
+            learned_with = TrainedResidual.load(run, robot).actuators
+            if dataset.undecided:
+                dataset = dataset.with_actuators(learned_with, f"those of {run}")
+            dataset.check_learned_with(learned_with, run)
     folder = resume or new_folder(data.output if first else None, task)
     if first:
         _announce(dataset, folder, data.quick)

@@ -83,7 +83,7 @@ def _evaluate(options: Options) -> None:
     robot = own if options.robot is None else load_robot(options.robot)
     check_simulates(robot)
     loaded = TrainedResidual.load(options.run, robot, which, other_model=robot is not own)
-    paths = list_recordings(options.recordings) or find_recordings(config, "test", options.run)
+    paths = list_recordings(options.recordings) or find_recordings(config, "test", options.run, "--recordings")
     recordings = [read_recording(path, robot) for path in paths]
     for path, recording in zip(paths, recordings, strict=True):
         check_recording(path, recording, robot, long_enough=True)

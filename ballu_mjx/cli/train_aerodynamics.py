@@ -15,7 +15,7 @@ from ballu_mjx.residuals.aerodynamics_fit import AirConfig, check_air_config
 from ballu_mjx.residuals.aerodynamics_training import fit_aerodynamics
 from ballu_mjx.residuals.dataset import RecordingsData
 from ballu_mjx.residuals.trained_residual import TrainedResidual
-from ballu_mjx.robots.registry import DEFAULT_ROBOT, load_robot
+from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.runs.progress import PhaseProgress
 from ballu_mjx.runs.record import TrainingRecord
 
@@ -29,8 +29,8 @@ class AirData(RecordingsData):
 
     fixed_from: Path | None = None
     """Folder of an earlier run. Parameters that are not in --free keep their values of that run. For example, balloons
-    lose lift over weeks, and `--fixed-from RUN --free lift` identifies the present lift from one recording. Without
-    this option: they are 0."""
+    lose lift over weeks, and `--fixed-from RUN --free lift` identifies the present lift from one recording. The
+    actuators are those of that run, unless --actuators names others. Without this option: they are 0."""
     free: tuple[Literal[AIR_PARAMETERS], ...] = AIR_PARAMETERS  # pyright: ignore[reportInvalidTypeForm]
     """Parameters to identify. The others keep their values of --fixed-from, or are 0. Leave out the lift if the model
     has a weighed value: the fit can attribute errors of the legs' model to the lift."""
@@ -38,10 +38,11 @@ class AirData(RecordingsData):
 
 def train(data: AirData, fit: AirConfig) -> int:
     """Read and check all inputs, identify the air, evaluate the result, and return the exit status."""
-    check_air_config(fit, load_robot(data.robot or DEFAULT_ROBOT).control_timestep)
+    robot = load_chosen_robot(data.robot, residual=data.fixed_from)
+    check_air_config(fit, robot.control_timestep)
     if not data.free:
         raise InputError(f"--free names no parameter; choose from {', '.join(AIR_PARAMETERS)}.")
-    earlier = _earlier(data)
+    earlier = _earlier(data, robot)
 
     def learn(prepared: Prepared, run: TrainingRecord) -> TrainedResidual:
         return fit_aerodynamics(
@@ -54,14 +55,17 @@ def train(data: AirData, fit: AirConfig) -> int:
             progress=PhaseProgress(),
         )
 
-    return train_residual("aerodynamic", data, lambda prepared: {"fit": fit, "data": data}, learn, show_report)
+    def sections(prepared: Prepared) -> Mapping[str, Any]:
+        return {"fit": fit, "data": data}
+
+    return train_residual("aerodynamic", data, sections, learn, show_report, earlier=data.fixed_from)
 
 
-def _earlier(data: AirData) -> TrainedResidual | None:
+def _earlier(data: AirData, robot: RobotDescription) -> TrainedResidual | None:
     """Return the residual of --fixed-from. None without this option."""
     if data.fixed_from is None:
         return None
-    found = TrainedResidual.load(data.fixed_from, load_chosen_robot(data.robot))
+    found = TrainedResidual.load(data.fixed_from, robot)
     if not isinstance(found.model, Aerodynamics):
         raise InputError(f"{data.fixed_from}: is no run of `train aerodynamic`; give --fixed-from one of its runs.")
     return found

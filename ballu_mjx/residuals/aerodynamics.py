@@ -155,7 +155,12 @@ def read_air_parameters(path: Path, robot: RobotDescription) -> AirParameters:
 
 def air_parameters_to_json(params: AirParameters) -> dict[str, Any]:
     """Return parameters as JSON types: numbers and lists of three numbers, by name."""
-    return {name: np.asarray(getattr(params, name), np.float64).round(9).tolist() for name in AIR_PARAMETERS}
+    return {name: _shortest(np.asarray(getattr(params, name), np.float32)) for name in AIR_PARAMETERS}
+
+
+def _shortest(values: np.ndarray) -> Any:
+    """Return numbers with the fewest digits that give the same values in single precision."""
+    return [float(str(value)) for value in values] if values.ndim else float(str(values))
 
 
 def air_parameters_from_json(values: Mapping[str, Any], path: Path, robot: RobotDescription) -> AirParameters:

@@ -5,7 +5,7 @@ commands. Nonlinear least squares minimizes the errors of the tracked body's pos
 robust, so that single bad windows, for example with a slipping contact, do not dominate.
 
 Finite differences over a parameter's order of magnitude replace derivatives. If contacts begin at other times than in
-the recording, derivatives with respect to the lift hold for less than 1 mN. The errors change smoothly over 30 mN
+the recording, derivatives with respect to the lift hold for less than 1 mN. The errors change smoothly over tens of mN
 (`docs/white_box.md`, "Why not derivatives").
 """
 
@@ -207,7 +207,7 @@ def identify_air(
             np.zeros(len(places)),
             jacobian,  # pyright: ignore[reportArgumentType]
             bounds=((low[places] - middle) / spread, (high[places] - middle) / spread),
-            max_nfev=most * len(start) // len(places),
+            max_nfev=_limit(most, len(places)),
             ftol=_GAIN,
             xtol=_STEP,
         )
@@ -234,6 +234,22 @@ def identify_air(
         windows=simulated.count,
         control_steps=simulated.control_steps,
     )
+
+
+def most_evaluations(config: AirConfig, free: Sequence[str]) -> int:
+    """Return the largest number of evaluations of `identify_air`."""
+    none = AirParameters.none()
+    sizes = {name: getattr(none, name).size for name in free}
+    found = 1 + _limit(config.evaluations, sum(sizes.values()))
+    if "delay" in sizes:
+        found += 2 * _limit(_DELAY_EVALUATIONS, sum(sizes.values()) - sizes["delay"])
+    return found
+
+
+def _limit(most: int, free: int) -> int:
+    """Return the limit of evaluations with `free` parameters, if it is `most` with all of them. Few take more steps."""
+    every = ravel_pytree(AirParameters.none())[0].size
+    return most * every // free if free else 1
 
 
 class Optimum(NamedTuple):

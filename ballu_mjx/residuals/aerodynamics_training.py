@@ -18,16 +18,13 @@ from ballu_mjx.residuals.aerodynamics import (
     Aerodynamics,
     air_parameters_to_json,
 )
-from ballu_mjx.residuals.aerodynamics_fit import AirConfig, AirFit, check_air_config, identify_air
+from ballu_mjx.residuals.aerodynamics_fit import AirConfig, AirFit, check_air_config, identify_air, most_evaluations
 from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.residuals.white_box_training import FitReport, fitted_residual
 from ballu_mjx.robots.model import same_parameters
 from ballu_mjx.runs.progress import PhaseProgress
 from ballu_mjx.runs.record import MemoryRecord, TrainingRecord
 from ballu_mjx.sim.simulator import Simulator
-
-_FURTHER_EVALUATIONS = 9
-"""Largest number of evaluations in addition to the first fit: one before it, and two fits at whole delays after it."""
 
 
 def fit_aerodynamics(
@@ -73,7 +70,7 @@ def fit_aerodynamics(
             f"The earlier residual is of the kind {fixed_from.model.name}, not aerodynamic; give an aerodynamic one."
         )
     record = MemoryRecord({"fit": dataclasses.asdict(config)}) if run is None else run
-    report, most = FitReport(record, progress, "cost"), _FURTHER_EVALUATIONS + config.evaluations
+    report, most = FitReport(record, progress, "cost"), most_evaluations(config, free)
     values = None if fixed_from is None else fixed_from.params
     found = identify_air(
         simulator,
@@ -125,7 +122,7 @@ def air_table(found: AirFit) -> str:
         single = not isinstance(values[name], list)
         rows = [(values[name], errors[name])] if single else zip(values[name], errors[name], strict=True)
         for axis, (value, error) in zip("xyz", rows, strict=False):
-            lines.append(f"{name:18}{'' if single else axis:4}{value:>12.5f}{error:>12.5f}  {unit}")
+            lines.append(f"{name:18}{'' if single else axis:4}{value:>12.4g}{error:>12.2g}  {unit}")
     lines.append(
         f"{found.windows} windows; robust cost {found.cost[0]:.1f} before the fit, {found.cost[1]:.1f} after it. Axes "
         "are those of the buoyant body."

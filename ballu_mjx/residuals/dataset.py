@@ -72,7 +72,8 @@ class ResidualDataset:
     """Source of the actuators, as text for the user."""
     robot: RobotDescription
     undecided: bool = False
-    """Whether to compare the identified with the nominal actuators and take the better ones."""
+    """Whether the user leaves the choice of actuators open. Those of an earlier run are then taken or, without one, the
+    better of identified and nominal ones."""
 
     def with_actuators(self, identified: ModelParameters | None, where: str) -> ResidualDataset:
         """Return the dataset with actuators that are decided on (None for nominal ones). `where` names their source."""
@@ -89,11 +90,11 @@ class ResidualDataset:
         files = _choose(data, robot, earlier)
         recordings = _read(files, robot)
         found = _actuators(data, earlier, files["training"], recordings["training"], robot)
-        undecided = data.actuators == AUTO and earlier is None and found[0] is not None
+        undecided = data.actuators == AUTO and earlier is None
         return ResidualDataset(files, recordings, *found, robot, undecided)
 
-    def check_base_residual(self, learned_with: ModelParameters | None, run: Path | None) -> None:
-        """Check that the base residual of `run` was learned with the actuators of this dataset.
+    def check_learned_with(self, learned_with: ModelParameters | None, run: Path) -> None:
+        """Check that the residual of `run` was learned with the actuators of this dataset.
 
         **Raises** `InputError` if it was not.
         """
@@ -154,7 +155,8 @@ def _choose(data: RecordingsData, robot: RobotDescription, earlier: Path | None)
     files = {use: list_recordings(paths) for use, paths in own.items() if paths}
     if earlier is not None:
         config = read_config(earlier, "envmimic")
-        files = {use: find_recordings(config, use, earlier) for use in USES if use not in files} | files
+        options = {use: "--recordings" if use == "training" else f"--{use}" for use in USES if use not in files}
+        files = {use: find_recordings(config, use, earlier, option) for use, option in options.items()} | files
     elif data.recordings:
         files.setdefault("validation", files["training"])
         files.setdefault("test", files["validation"])

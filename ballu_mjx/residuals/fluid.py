@@ -215,7 +215,7 @@ class FluidEstimate:
         """Return a table of the parameters that differ from 0 by two standard errors or more, as text."""
         lines = [f"{'':10}{'term':12}{'value':>12}{'std. error':>12}"]
         lines += [
-            f"{group:10}{name:12}{value:>12.5f}{error:>12.5f}"
+            f"{group:10}{name:12}{value:>12.4g}{error:>12.2g}"
             for group, name, value, error in self._entries()
             if abs(value) >= 2 * error > 0
         ]

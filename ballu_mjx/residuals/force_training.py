@@ -32,6 +32,7 @@ from ballu_mjx.rl.ppo import Params, PPOConfig
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.runs.progress import PhaseProgress
 from ballu_mjx.runs.record import MemoryRecord, TrainingRecord
+from ballu_mjx.sim import force_sets
 from ballu_mjx.sim.force_sets import FORCE_SETS, ForceSet
 from ballu_mjx.sim.linearize import Linearizer
 from ballu_mjx.sim.residual import add_to_base
@@ -101,9 +102,10 @@ def network_sections(forces: ForceSet | EnvMimicConfig, seed: int) -> tuple[EnvM
 def free_torques(forces: ForceSet, robot: RobotDescription) -> tuple[str, ...]:
     """Return the joints whose torques are unknowns of the labelling, in addition to the loads.
 
-    There are none if the loads are forces along joints or changes of commands, which cause such torques themselves.
+    There are none if the loads are forces along joints or changes of commands, which cause such torques themselves, or
+    if residual forces may act along no joint.
     """
-    return robot.joints if FORCE_SETS[forces].turns else ()
+    return robot.joints if FORCE_SETS[forces].turns and force_sets.num_loads("joints", robot) else ()
 
 
 def resolve_torque_spread(

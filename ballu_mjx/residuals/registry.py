@@ -127,5 +127,3 @@ KINDS: Mapping[str, ResidualKind] = {
 """All kinds of residual, by name."""
 RESIDUAL_TASKS = tuple(KINDS)
 """Tasks whose runs have a residual."""
-NETWORK_TASKS = tuple(name for name, kind in KINDS.items() if kind.network)
-"""Tasks whose runs have a network of forces."""

@@ -130,15 +130,15 @@ def describe_recording(path: Path) -> dict[str, str]:
     return {"path": place, "sha256": hashlib.sha256(path.read_bytes() + b"\0" + described).hexdigest()}
 
 
-def find_recordings(config: Mapping[str, Any], use: str, folder: Path) -> list[Path]:
-    """Return the recordings that a run's `config.json` names under `use`.
+def find_recordings(config: Mapping[str, Any], use: str, folder: Path, option: str) -> list[Path]:
+    """Return the recordings that a run's `config.json` names under `use`. `option` is the option for other recordings.
 
     **Raises** `InputError` if a recording is missing or has changed.
     """
     paths = []
     described = config_section(config, "recordings", folder).get(use)
     if not described:
-        raise InputError(f"{folder / CONFIG_FILE}: names no recordings for {use}; give some on the command line.")
+        raise InputError(f"{folder / CONFIG_FILE}: names no recordings for {use}; give some by {option}.")
     for entry in described:
         place = entry["path"]
         path, there = Path(place), False
@@ -149,12 +149,12 @@ def find_recordings(config: Mapping[str, Any], use: str, folder: Path) -> list[P
         if not there:
             raise InputError(
                 f"{_cut(place)}: the recording is missing, but {folder / CONFIG_FILE} names it; restore it or give "
-                "--recordings."
+                f"{option}."
             )
         if describe_recording(path)["sha256"] != entry["sha256"]:
             raise InputError(
                 f"{path}: the recording has changed since {folder / CONFIG_FILE} was written; restore it, or give it "
-                "by --recordings to use it as it is."
+                f"by {option} to use it as it is."
             )
         paths.append(path)
     return paths

@@ -21,7 +21,8 @@ A description is a JSON file with the keys
 - `limits` (optional): bounds that no recording of this robot exceeds: `height` ([low, high], m), `distance` (m),
   `speed` (m/s), `angle` (rad or m);
 - `mirror` (optional): for a robot that is symmetric about the xz plane, pairs of names (points, commands, joints) that
-  the mirror image swaps, as `{"foot_left": "foot_right"}`; `{}` if it swaps none;
+  the mirror image swaps, as `{"foot_left": "foot_right"}`; `{}` if it swaps none. A command that it does not swap has
+  the same value in the mirror image;
 - `adapter` (optional): `module:Class`, a `robots.adapter.RobotAdapter` with code that only this robot needs;
 - `identify` (optional): list of the parameters that recordings may identify; see `identification.declarations`;
 - `upright` (optional): `true` if the tracked body never tilts far. Orientation errors are then errors of yaw. With
@@ -212,6 +213,11 @@ def read_description(path: Path | str) -> RobotDescription:
     keyframe = content.get("keyframe")
     if keyframe is not None:
         check_keyframe(path, model, read_text(path, content, "keyframe"))
+    mirror = read_mirror(path, content.get("mirror"), (*points, *driven, *joints))
+    for command, span in zip(driven, ranges, strict=True):
+        other = (mirror or {}).get(command, command)
+        if other in driven and ranges[list(driven).index(other)] != span:
+            refuse(path, f'"mirror" swaps {command} and {other}, whose ranges differ', "give them the same range")
     found = RobotDescription(
         file=path,
         name=name,
@@ -228,7 +234,7 @@ def read_description(path: Path | str) -> RobotDescription:
         oriented_points=oriented,
         keyframe=keyframe,
         limits=read_limits(path, content.get("limits", {})),
-        mirror=read_mirror(path, content.get("mirror"), (*points, *driven, *joints)),
+        mirror=mirror,
         adapter=read_adapter(path, content.get("adapter")),
         identify=read_entries(path, "identify", content.get("identify", [])),
         upright=read_flag(path, "upright", content.get("upright", False)),

@@ -577,7 +577,7 @@ def _run_formats(place: Callable[[], Path], robot_name: str) -> list[Format]:
         ]
         run_actuators(config, folder, load_robot())
         run_residual(config, folder)
-        find_recordings(config, "training", folder)
+        find_recordings(config, "training", folder, "--recordings")
         report_content.collect(folder)
         compare.rows([folder])
         compare.figures(folder)

@@ -233,7 +233,7 @@ def test_change_of_the_json_file_of_a_recording_is_refused(
     (tmp_path / "flight.json").write_text(json.dumps(content | {"robot": "another"}))
     assert describe_recording(path)["sha256"] != before["sha256"]
     with pytest.raises(InputError, match="the recording has changed"):
-        find_recordings({"recordings": {"test": [before]}}, "test", tmp_path)
+        find_recordings({"recordings": {"test": [before]}}, "test", tmp_path, "--test")
 
 
 def test_other_robots_require_the_option_recordings(capsys: pytest.CaptureFixture[str]):
