@@ -126,7 +126,7 @@ def vanilla_ratio(folder: str) -> float:
     path = Path(folder)
     robot = load_robot()
     trained = TrainedResidual.load(path, robot)
-    paths = find_recordings(read_config(path, "envmimic"), "validation", path)
+    paths = find_recordings(read_config(path, "envmimic"), "validation", path, "--validation")
     recordings = [read_recording(each, robot) for each in paths]
 
     def evaluate(simulator: Simulator) -> Evaluation:

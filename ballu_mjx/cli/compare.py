@@ -16,7 +16,7 @@ import numpy as np
 import tyro
 
 from ballu_mjx.cli._help import parse_options
-from ballu_mjx.common import runtime
+from ballu_mjx.common import files, runtime
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.evaluation.seed_intervals import LEVEL, t_interval
 
@@ -200,6 +200,8 @@ def _compare(options: Options) -> None:
 
     if not options.runs:
         raise InputError("No run is given; name one or more run folders.")
+    if options.output is not None:
+        files.check_folder(options.output)
     found = rows(options.runs)
     text = table({row.label: [figures(folder) for folder in row.folders] for row in found})
     print(text)
@@ -228,8 +230,8 @@ def _options(config: Mapping[str, Any]) -> dict[str, str]:
     robot = config.get("robot_description")
     found["robot"] = DEFAULT_ROBOT if robot is None else Path(robot["path"]).name.removesuffix(".robot.json")
     found["actuators"] = "nominal" if config.get("actuators") is None else _digest(config["actuators"])
-    for use, files in config.get("recordings", {}).items():
-        found[f"{use} recordings"] = _digest([file["sha256"] for file in files])
+    for use, recordings in config.get("recordings", {}).items():
+        found[f"{use} recordings"] = _digest([each["sha256"] for each in recordings])
     found["residual"] = config.get("residual") or "none"
     return found
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -260,8 +261,10 @@ def _write(options: Import, robot: RobotDescription, recording: Recording) -> No
     except InputError as error:
         for path in (options.output, sidecar_path(options.output)):
             path.unlink()
+        found = str(error).replace(f"{options.output}, ", "").replace(f"{options.output}: ", "")
         raise InputError(
-            f"{options.file}: gives no valid recording with {options.mapping}, nothing written: {error}"
+            f"{options.file}: gives no valid recording with {options.mapping}, nothing written: {found} Check [units], "
+            f"[clock] and [axes] in {options.mapping}, too."
         ) from error
     duration = read.time[-1] - read.time[0]
     filled = sum(read.interpolated.values())
@@ -303,7 +306,7 @@ def _map(options: Map) -> None:
 
 
 def _check(options: Check) -> int:
-    from ballu_mjx.recordings.csv_format import list_recordings, read_recording
+    from ballu_mjx.recordings.csv_format import list_recordings, read_recording, recording_name
     from ballu_mjx.recordings.summary import find_gaps, summarize_recording
     from ballu_mjx.robots.registry import load_robot
     from ballu_mjx.viz.recording import draw_recording
@@ -313,7 +316,9 @@ def _check(options: Check) -> int:
     if not paths:
         raise InputError("There is no recording to check; name a recording, or a folder of recordings.")
     if options.output is not None:
+        files.check_folder(options.output)
         options.output.mkdir(parents=True, exist_ok=True)
+    names = Counter(map(recording_name, paths))
     broken = 0
     for path in paths:
         try:
@@ -325,7 +330,9 @@ def _check(options: Check) -> int:
         gaps = find_gaps(path)
         print(summarize_recording(path, recording, robot, gaps))
         if options.output is not None:
-            figure = options.output / f"{recording.name}.png"
+            # Recordings of several folders may have the same name.
+            stem = recording.name if names[recording.name] == 1 else f"{path.parent.name}-{recording.name}"
+            figure = options.output / f"{stem}.png"
             draw_recording(figure, recording, robot, gaps)
             print(f"  drawn in {figure}")
     return 2 if broken else 0

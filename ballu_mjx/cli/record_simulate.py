@@ -56,6 +56,7 @@ def simulate(options: Simulate) -> None:
     for name in ("robot_seed", "trial_seed"):
         if getattr(options, name) < 0:
             raise InputError(f"--{name.replace('_', '-')} {getattr(options, name)}: seeds are 0 or more.")
+    _check_used(options)
     robot, name = load_robot(), recording_name(options.output)
     virtual = virtual_robot.draw_robot(options.robot_seed)
     if options.suspended:
@@ -80,6 +81,21 @@ def simulate(options: Simulate) -> None:
     write_recording(result, options.output, robot, decimals=4)
     recording, gaps = read_recording(options.output, robot), find_gaps(options.output)
     print(summarize_recording(options.output, recording, robot, gaps))
+
+
+def _check_used(options: Simulate) -> None:
+    """Check that no option is given that has no effect beside the others.
+
+    **Raises** `InputError` if there is one.
+    """
+    unused, beside = ("levels", "hold"), "a gait" if options.commands is None else "--commands"
+    if options.suspended:
+        unused, beside = ("seconds",), "--suspended"
+    elif options.commands is not None:
+        unused = ("seconds", *unused)
+    for name in unused:
+        if getattr(options, name) != getattr(Simulate, name):
+            raise InputError(f"--{name} has no effect beside {beside}; leave it out.")
 
 
 def _commands(options: Simulate, robot: RobotDescription) -> tuple[Float[np.ndarray, "steps 2"], str]:

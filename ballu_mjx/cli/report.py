@@ -51,6 +51,7 @@ def _report(options: Options) -> None:
     path = options.output or options.run / REPORT_FILE
     if path.is_dir():
         raise InputError(f"--output {path}: is a folder; give a file.")
+    files.check_folder(path.parent)
     content = collect(options.run)
     if options.show is not None and options.show not in (names := [take.name for take in content.takes]):
         raise InputError(f"--show {options.show}: there is no such replay; give one of {', '.join(names) or 'none'}.")

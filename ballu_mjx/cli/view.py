@@ -18,7 +18,7 @@ import numpy as np
 import tyro
 
 from ballu_mjx.cli._help import parse_options
-from ballu_mjx.common import runtime
+from ballu_mjx.common import files, runtime
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.runs.rollout_file import ROLLOUT_FILE, StoredRollout, read_rollouts
 
@@ -65,11 +65,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
             if options.mujoco:
                 check_screen()
             runtime.prepare()
+            if options.rerun is not None:
+                files.check_folder(options.rerun.parent)
             takes = load(options.source, options.robot)
             first = choose(takes, options.show)
             if options.rerun is not None:
                 from ballu_mjx.viz.rerun_file import write_rerun
 
+                options.rerun.parent.mkdir(parents=True, exist_ok=True)
                 write_rerun(options.rerun, takes[first])
                 print(f"Written to {options.rerun}; `rerun {options.rerun}` shows it.")
             elif options.mujoco:
@@ -91,6 +94,8 @@ def load(source: Path, robot: str = "ballu") -> list[StoredRollout]:
         from ballu_mjx.viz.report_content import collect
 
         takes = collect(source).takes
+        if not takes:
+            _check_has_replay(source)
         return takes or read_rollouts(source / ROLLOUT_FILE)
     from ballu_mjx.recordings.csv_format import list_recordings, read_recording
     from ballu_mjx.recordings.reconstruct import reconstruct
@@ -112,6 +117,24 @@ def load(source: Path, robot: str = "ballu") -> list[StoredRollout]:
             command=motion.command,
         )
     ]
+
+
+def _check_has_replay(run: Path) -> None:
+    """Check that a run whose replay is missing is that of a residual, which `evaluate` writes.
+
+    **Raises** `InputError` otherwise.
+    """
+    from ballu_mjx.policies.tasks import TASKS
+    from ballu_mjx.residuals.registry import RESIDUAL_TASKS
+    from ballu_mjx.runs.folder import read_config
+
+    task = read_config(run, *RESIDUAL_TASKS, *TASKS, "sysid")["task"]
+    if task == "sysid":
+        raise InputError(f"{run}: an identification has no replay; give the run of a residual or a policy.")
+    if task in TASKS:
+        raise InputError(
+            f"{run}: has no {ROLLOUT_FILE}; `python -m ballu_mjx.train {task} --resume {run}` writes it again."
+        )
 
 
 def choose(takes: Sequence[StoredRollout], name: str | None) -> int:

@@ -248,7 +248,7 @@ def _newton_step(found: _Solution, model: mjx.Model, data: mjx.Data) -> tuple[_S
     The Hessian of the cost is held constant, because the factor of its derivative is zero at the minimum.
     """
     # MJX's other solver would leave the constraints out of the Hessian.
-    model = model.tree_replace({"opt.solver": mjx.SolverType.NEWTON})
+    model = model.replace(opt=model.opt.replace(solver=mjx.SolverType.NEWTON))  # pyright: ignore
     data = data.replace(qacc=found.qacc)  # pyright: ignore
     here = Context.create(model, data, grad=False)
     gradient = here.Ma - data.qfrc_smooth - here.qfrc_constraint

@@ -16,7 +16,13 @@ from scipy.spatial.transform import Rotation
 from ballu_mjx.ballu.gaits import GAITS
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.cli import record
-from ballu_mjx.recordings.csv_format import list_bundled, read_recording, write_recording
+from ballu_mjx.recordings.csv_format import (
+    list_bundled,
+    read_recording,
+    recording_name,
+    sidecar_path,
+    write_recording,
+)
 from ballu_mjx.recordings.importers.example_mapping import example_mapping
 from ballu_mjx.recordings.recording import Recording, cut
 from ballu_mjx.recordings.summary import find_gaps
@@ -281,3 +287,30 @@ def test_example_mapping_is_printed_and_documented(tmp_path: Path):
     assert done.returncode == 0 and done.stdout == example_mapping(load_robot())
     page = (Path(__file__).parents[2] / "docs" / "data.md").read_text()
     assert example_mapping(load_robot()) in page
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--suspended", "--seconds", "60"], "--seconds has no effect beside --suspended"),
+        (["--gait", "walking", "--hold", "1"], "--hold has no effect beside a gait"),
+        (["--commands", "a.csv", "--seconds", "5"], "--seconds has no effect beside --commands"),
+    ],
+)
+def test_simulation_refuses_options_without_an_effect(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], message: str
+):
+    assert record.main(["simulate", "--output", str(tmp_path / "a.csv"), *options]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_figures_of_recordings_with_the_same_name_are_kept_apart(tmp_path: Path):
+    source = list_bundled("test")[0]
+    for folder in ("one", "other"):
+        (tmp_path / folder).mkdir()
+        for path in (source, sidecar_path(source)):
+            (tmp_path / folder / path.name).write_bytes(path.read_bytes())
+    folders = [str(tmp_path / folder) for folder in ("one", "other")]
+    assert record.main(["check", *folders, "--output", str(tmp_path / "figures")]) == 0
+    name = recording_name(source)
+    assert {path.name for path in (tmp_path / "figures").iterdir()} == {f"one-{name}.png", f"other-{name}.png"}

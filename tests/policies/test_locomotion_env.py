@@ -251,7 +251,7 @@ def test_residuals_of_one_kind_share_one_compiled_program():
         state = jax.eval_shape(learner._first, jax.random.PRNGKey(0), learner._parameters)
         training.append(learner._step.lower(state, learner._parameters).as_text())
         loop = ClosedLoop(env, lambda params, seen: params.value * seen[:2])
-        state = jax.eval_shape(loop._reset, env.parameters, jax.random.split(jax.random.key(0), 8))
+        state = jax.eval_shape(jax.vmap(env.reset), jax.random.split(jax.random.key(0), 8))
         closed_loop.append(loop._run.lower(GAIN, env.parameters, state).as_text())
     assert training[0] == training[1]
     assert closed_loop[0] == closed_loop[1]

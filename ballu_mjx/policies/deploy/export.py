@@ -79,19 +79,23 @@ def export_policy(options: ExportOptions) -> Path:
         print("Compiling: about a minute the first time ...", flush=True)
         commands = open_loop(policy, max(round(seconds / policy.robot.control_timestep), 1))
 
+    texts = {
+        **sources(),
+        POLICY_FILE: json.dumps(describe_policy(policy, stored, options.run), indent=2) + "\n",
+        "README.txt": _readme(options, policy, stored, commands),
+    }
+    graph = policy_onnx(stored) if options.onnx else None
+    # Only now, so that an error above leaves no incomplete folder.
     folder.mkdir(parents=True, exist_ok=True)
-    for name, text in sources().items():
+    for name, text in texts.items():
         (folder / name).write_text(text, encoding="utf-8")
     np.savez(folder / "weights.npz", **stored)  # pyright: ignore[reportArgumentType]
-    described = json.dumps(describe_policy(policy, stored, options.run), indent=2) + "\n"
-    (folder / POLICY_FILE).write_text(described, encoding="utf-8")
-    if options.onnx:
-        (folder / "policy.onnx").write_bytes(policy_onnx(stored))
+    if graph is not None:
+        (folder / "policy.onnx").write_bytes(graph)
     if commands is not None:
         _write_commands(folder / "commands.csv", commands, policy.robot, options)
         if (said := _rate(commands, stored)) is not None:
             print(said)
-    (folder / "README.txt").write_text(_readme(options, policy, stored, commands), encoding="utf-8")
     print(f"Written to {folder}: {', '.join(sorted(path.name for path in folder.iterdir()))}.")
     return folder
 

@@ -216,8 +216,21 @@ def _turn_lines(contents: Contents, stem: str | None) -> list[str]:
         stem, guess = next(iter(turns)), "  # a guess: the only quaternion"
     if stem is None:
         return ['orientation = ["", "", "", ""]  # choose its columns', 'rotation = "quaternion"']
-    guess = "  # a guess: w, x, y, z" if "[" in turns[stem][0] else guess
-    return [f"orientation = {json.dumps([items[name].name for name in turns[stem]])}{guess}", 'rotation = "quaternion"']
+    chosen = [items[name] for name in turns[stem]]
+    if "[" in turns[stem][0]:
+        guess = "  # a guess: w, x, y, z"
+        if not _may_be_w(chosen[0]) and _may_be_w(chosen[3]):
+            chosen, guess = [chosen[3], *chosen[:3]], "  # a guess: x, y, z, w in the file"
+    return [f"orientation = {json.dumps([item.name for item in chosen])}{guess}", 'rotation = "quaternion"']
+
+
+def _may_be_w(item: Item) -> bool:
+    """Return whether the column of a quaternion reaches nearly 1 or -1, as w does near the reference orientation."""
+    return item.low is None or item.high is None or max(-item.low, item.high) > _NEARLY_UPRIGHT
+
+
+_NEARLY_UPRIGHT = 0.9
+"""Magnitude of w beyond which the other components are below 0.44."""
 
 
 # ---- axes, units, clock and commands ----

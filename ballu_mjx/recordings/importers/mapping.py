@@ -169,6 +169,9 @@ def read_mapping(path: Path, robot: RobotDescription) -> RoomMapping:
         fix = 'give it by body = "...", by markers = [...] or by orientation = [...]'
         refuse(path, f"[{robot.tracked}]", "its orientation is missing", fix)
     given = [name for name in robot.joints if name in content]
+    for name in robot.joints:
+        if kind == "suspended" and name not in given:
+            refuse(path, f"[{name}]", "the table is missing", f'give its column, such as column = "{name}"')
     model = robot.load_model()
     joints = {name: _joint(top.keys(name), slides=_slides(model, name)) for name in given}
     commands = _commands(top.keys("commands"), robot)

@@ -77,7 +77,7 @@ class Table:
             cell = row[place].strip()
             value = parse_number(cell) if cell and cell.lower() != "nan" else math.nan
             if value is None:
-                fix = "write a number, or leave the cell empty if the sample is missing"
+                fix = "write a number with a decimal point, or leave the cell empty if the sample is missing"
                 where = f"line {self.lines[i]}, column {shorten(name)}"
                 refuse(self.path, where, f"{shorten(cell)!r} is not a number", fix)
             values[i] = value
