@@ -16,6 +16,7 @@ from ballu_mjx.ballu.features import foot_positions
 from ballu_mjx.ballu.gait import count_steps
 from ballu_mjx.ballu.model import JOINTS, SIDES, standing_qpos
 from ballu_mjx.ballu.sweep import LEVELS, read_sweep
+from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.inverse_kinematics import KinematicFit
 from ballu_mjx.recordings.motion import MeasurementGrid
 from ballu_mjx.recordings.recording import Recording
@@ -27,7 +28,7 @@ from ballu_mjx.robots.adapter import (
     RobotAdapter,
 )
 from ballu_mjx.robots.description import RobotDescription
-from ballu_mjx.robots.model import ModelParameters
+from ballu_mjx.robots.model import ModelParameters, assets
 
 _POINTS = ("base", "foot_left", "foot_right")
 _ANGLES = ("motor_left", "motor_right", "knee_left", "knee_right")
@@ -118,7 +119,7 @@ class Ballu(RobotAdapter, RecordingHooks):
         progress: IdentificationProgress | None = None,
     ) -> IdentifiedActuators:
         """Return both legs' actuators, identified from a sweep; see `identified_legs.identify_from_sweep`."""
-        del robot
+        self._check_bundled(robot)
         from ballu_mjx.ballu.identified_legs import identify_from_sweep  # Optimistix: slow to import
 
         return identify_from_sweep(recordings, config, levels, progress)
@@ -126,10 +127,22 @@ class Ballu(RobotAdapter, RecordingHooks):
     def check_sweep(self, robot: RobotDescription, recordings: Mapping[Path, Any], levels: int | None = None) -> None:
         """Check that the recordings are a sweep of both legs; see `sweep.read_sweep`.
 
-        **Raises** `InputError` if they are not.
+        **Raises** `InputError` if they are not, or if the robot's model is not the bundled one.
         """
-        del robot
+        self._check_bundled(robot)
         read_sweep(recordings, levels=LEVELS if levels is None else levels)
+
+    @staticmethod
+    def _check_bundled(robot: RobotDescription) -> None:
+        """Check that the robot has the bundled model, which the fit of the legs simulates.
+
+        **Raises** `InputError` if it does not.
+        """
+        if robot.model.read_bytes() != (assets() / "ballu.xml").read_bytes():
+            raise InputError(
+                f"{robot.file}: the fit of BALLU's legs needs the bundled model, but {robot.model.name} differs from "
+                'it; declare parameters under "identify" and leave out "adapter".'
+            )
 
     def read_actuators(self, robot: RobotDescription, path: Path) -> tuple[str, ModelParameters]:
         """Return the robot's name and its parameters from a file; see `actuators_file.read_actuators`."""

@@ -131,14 +131,15 @@ class Identifier:
             rich[list(free).index("knee_spring_stiffness")] = not config.nominal_springs
             coordinates, richer_ends = self._search(residuals, rich, report, simpler)
             spread = residuals.spread(coordinates)
-            more = int(rich.sum()) - int((~further).sum())
-            selection = select_model(simpler, coordinates, more, spread, residuals)
+            sizes = coordinates.size, int(rich.sum()) - int((~further).sum())
+            after = residuals(coordinates, every)[0]
+            selection = select_model(residuals(simpler, every)[0], after, spread, *sizes)
             if selection.richer:
                 # The simpler search may have ended in a local minimum that the richer one left.
                 again = np.where(further, simpler, coordinates)
                 again = self._follow(again, residuals, ~further, report, config.steps)
                 simpler = self._nearest([simpler, again], residuals, ~further)
-                selection = select_model(simpler, coordinates, more, spread, residuals)
+                selection = select_model(residuals(simpler, every)[0], after, spread, *sizes)
             if selection.richer:
                 kept, ends = rich, richer_ends
             else:

@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Float
 from scipy.stats import f as f_distribution
 
-from ballu_mjx.ballu.leg_residuals import LegResiduals
 from ballu_mjx.ballu.model import SIDES
 from ballu_mjx.identification.undeclared import SMALL_EFFECT
 
@@ -34,19 +33,22 @@ class Selection(NamedTuple):
 
 
 def select_model(
-    simpler: Float[np.ndarray, "legs size"],
-    richer: Float[np.ndarray, "legs size"],
-    more: int,
+    simpler: Float[np.ndarray, "legs residuals"],
+    richer: Float[np.ndarray, "legs residuals"],
     spread: Float[np.ndarray, "legs residuals"],
-    residuals: LegResiduals,
+    size: int,
+    more: int,
 ) -> Selection:
-    """Compare the solutions of two models that differ by `more` parameters for each leg."""
-    every = np.ones(richer.shape[1], bool)
-    before, after = (residuals(y, every)[0] for y in (simpler, richer))
-    chi_squared = float(np.sum(after**2 / spread**2))
-    between, within = more * len(SIDES), max(chi_squared - richer.size, 1.0)
-    statistic = float(np.sum((before**2 - after**2) / spread**2)) / between
-    effect = float(np.sum(before**2 - after**2) / max(np.sum(after**2), np.finfo(float).tiny))
+    """Compare the residuals of two models' solutions, which have standard deviations `spread` by chance.
+
+    The richer model has `size` parameters for both legs together, `more` of them further ones of each leg. It may hold
+    the springs, which the simpler one fits. The models are then not nested, and the distribution of F is an
+    approximation. If the numbers of parameters are equal, one further parameter is assumed.
+    """
+    chi_squared = float(np.sum(richer**2 / spread**2))
+    between, within = max(more, 1) * len(SIDES), max(chi_squared - size, 1.0)
+    statistic = float(np.sum((simpler**2 - richer**2) / spread**2)) / between
+    effect = float(np.sum(simpler**2 - richer**2) / max(np.sum(richer**2), np.finfo(float).tiny))
     return Selection(statistic, float(f_distribution.ppf(1 - _LEVEL, between, within)), effect)
 
 

@@ -154,7 +154,7 @@ def _train_declared(
     if both:
         raise InputError(f"{min(both)}: is among --recordings and --validation; remove it from one of them.")
     recordings, validation = ({path: read_recording(path, robot) for path in each} for each in (paths, held))
-    specimen = check_recordings(robot, {**recordings, **validation}, config.window_seconds)
+    specimen = check_recordings(robot, recordings, validation, config.window_seconds, sampling)
     folder = new_folder(data.output, "sysid")
     sections = {"fit": config, "sampling": sampling, "data": data}
     content = describe_run("sysid", sections, {"training": paths, "validation": held}, [], description=robot)

@@ -156,6 +156,10 @@ _RADIUS = 0.5
 """Default bound on the shift of a body's centre of mass, relative to its radius of gyration, and on its shears."""
 
 
+_TARGET_KEYS = ("field", "index", "factor")
+"""Keys of a target besides that of its element."""
+
+
 class _Declaration:
     """One entry of `identify`."""
 
@@ -165,7 +169,6 @@ class _Declaration:
         for key in entry:
             if key not in _KEYS:
                 self.refuse(f'has the key "{key}"', f"the keys are {', '.join(_KEYS)}")
-        self._nominal = [entry["nominal"]] if "nominal" in entry else []
 
     def refuse(self, problem: str, fix: str) -> NoReturn:
         """Raise `InputError` with the file, the entry, the problem and the fix."""
@@ -203,6 +206,13 @@ class _Declaration:
                 self.refuse(
                     'has "targets" that are not a list of objects', 'write [{"joint": ..., "field": ..., "factor": 1}]'
                 )
+            for target in targets:
+                for key in target:
+                    if key not in (*_ELEMENTS, *_TARGET_KEYS):
+                        self.refuse(
+                            f'has a target with the key "{key}"',
+                            f"its keys are an element and {', '.join(_TARGET_KEYS)}",
+                        )
             return [part for target in targets for part in self._part(target)]
         return self._part(self.entry)
 
@@ -338,12 +348,16 @@ class _Declaration:
         group = len(_BODY_GROUPS[parts[0][2]]) > 1
         reach = _RADIUS * math.sqrt(float(inertia.sum()) / 2 / mass) if quantity.startswith("com_") else _RADIUS
         bounds = (-reach, reach) if nominal == 0 else (nominal / _FACTOR, nominal * _FACTOR)
-        if group:  # one value does not suit several parameters
-            for key in ("bounds", "prior", "nominal", "unit"):
-                if key in self.entry:
-                    self.refuse(f'has "{key}" for several parameters', "leave it out")
-        else:
-            bounds = self._bounds(bounds)
+        for key in ("nominal", "unit", *(("bounds", "prior") if group else ())):
+            if key in self.entry:
+                problem = (
+                    f'has "{key}" for several parameters' if group else f'has "{key}", which follows from the model'
+                )
+                self.refuse(problem, "leave it out")
+        if not group:
+            bounds = self._bounds(bounds, nominal)
+        if nominal > 0 and bounds[0] <= 0:
+            self.refuse(f'has "bounds" that begin at {bounds[0]:g}', f"{quantity} must be above 0")
         prior = _SPREAD * (nominal or reach)
         unit = {"m": "kg", "c": "m"}.get(quantity[0], "1")
         prior = prior if group else self._positive("prior", prior)
@@ -370,12 +384,8 @@ class _Declaration:
                 "lag": (0.0, 0.2),
             }[field]
             prior = {"scale": 0.1, "delay": 0.02, "lag": 0.03, "rate_limit": math.inf}.get(field, 0.05 * span)
-        bounds = self._bounds(bounds)
-        nominal = min(nominal, bounds[1]) if math.isinf(nominal) else nominal
-        if not bounds[0] <= nominal <= bounds[1]:
-            self.refuse(
-                f'has "bounds" {bounds[0]:g} to {bounds[1]:g}, which exclude the nominal {nominal:g}', "widen them"
-            )
+        bounds = self._bounds(bounds, nominal)
+        nominal = min(nominal, bounds[1])
         if math.isnan(prior):
             prior = _SPREAD * nominal if nominal > 0 and field not in _SIGNED else (bounds[1] - bounds[0]) / 4
         if field not in _SIGNED and bounds[0] < 0 and field in self._known(kind):
@@ -405,13 +415,18 @@ class _Declaration:
             return _UNITS_OF_LENGTHS.get(field, _UNITS.get(field, ""))
         return {"scale": "1", "friction": "1", "rate_limit": "1/s"}.get(field, _UNITS.get(field, ""))
 
-    def _bounds(self, default: tuple[float, float] | None) -> tuple[float, float]:
+    def _bounds(self, default: tuple[float, float] | None, nominal: float) -> tuple[float, float]:
         value = self.entry.get("bounds", default)
         if value is None:
             self.refuse('has no "bounds", and its nominal value gives no default', 'add "bounds": [low, high]')
-        if len(value) != 2 or not all(map(is_number, value)) or not value[0] < value[1]:
+        pair = isinstance(value, list | tuple) and len(value) == 2 and all(map(is_number, value))
+        if not pair or not value[0] < value[1]:
             self.refuse(f'has "bounds" {value!r}', "write two numbers, the smaller first")
-        return float(value[0]), float(value[1])
+        low, high = map(float, value)
+        # An infinite nominal value (no rate limit) counts as the upper bound.
+        if nominal < low or (nominal > high and math.isfinite(nominal)):
+            self.refuse(f'has "bounds" {low:g} to {high:g}, which exclude the nominal {nominal:g}', "widen them")
+        return low, high
 
     def _number(self, key: str, default: float) -> float:
         value = self.entry.get(key, default)

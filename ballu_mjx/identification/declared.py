@@ -51,28 +51,50 @@ class IdentifiedByFit(IdentifiedActuators):
     suggestions: tuple[Suggestion, ...]
 
 
-def check_recordings(robot: RobotDescription, recordings: Mapping[Path, Recording], window_seconds: float) -> str:
+def check_recordings(
+    robot: RobotDescription,
+    recordings: Mapping[Path, Recording],
+    validation: Mapping[Path, Recording],
+    window_seconds: float,
+    sampling: SamplingConfig,
+) -> str:
     """Check that the recordings can be used, and return the name of their specimen (individual robot).
 
-    They must be of one specimen, and at least one must be as long as a window.
+    They must be of one specimen. One of `recordings` must be as long as a window, and one of `validation`, if there are
+    any. Either all or none of them must have all joints. If none has, `sampling` must have its defaults.
 
     **Raises** `InputError` naming the file and the fix.
     """
-    specimens = {recording.robot: path for path, recording in recordings.items()}
+    every = {**recordings, **validation}
+    specimens = {recording.robot: path for path, recording in every.items()}
     if len(specimens) != 1:
-        raise InputError(
-            f"The recordings are of several robots ({', '.join(sorted(specimens))}); give recordings of one robot."
-        )
-    for path, recording in recordings.items():
+        named = ", ".join(f"{path} is of {specimen}" for specimen, path in specimens.items())
+        raise InputError(f"The recordings are of several robots ({named}); give recordings of one robot.")
+    for path, recording in every.items():
         if recording.kind != "free" and not robot.anchored:
             raise InputError(
                 f"{path}: this recording is suspended, but {robot.model.name} has a free joint; give free recordings, "
                 "or a model without the free joint."
             )
-    if all(recording.time[-1] - recording.time[0] < window_seconds for recording in recordings.values()):
-        first = next(iter(recordings))
+    for option, group in (("--recordings", recordings), ("--validation", validation)):
+        if group and all(recording.time[-1] - recording.time[0] < window_seconds for recording in group.values()):
+            raise InputError(
+                f"{next(iter(group))}: none of {option} lasts {window_seconds:g} s; give longer recordings, or a "
+                "shorter --window-seconds."
+            )
+    model = robot.load_model()
+    measured = {path: _is_measured(recording, model) for path, recording in every.items()}
+    if any(measured.values()) and not all(measured.values()):
+        complete, lacking = (next(path for path, own in measured.items() if own == which) for which in (True, False))
+        missing = ", ".join(sorted(_joints(model) - set(every[lacking].joint_angles)))
         raise InputError(
-            f"{first}: no recording lasts {window_seconds:g} s; give longer recordings, or a shorter --window-seconds."
+            f"{lacking}: has no columns for {missing}, but {complete} has all joints; add them, or give either kind "
+            "alone."
+        )
+    if not any(measured.values()) and sampling != SamplingConfig():
+        raise InputError(
+            f"{next(iter(every))}: lacks joint angles, so that states are reconstructed at control steps; leave out "
+            "the options of sampling."
         )
     return next(iter(specimens))
 
@@ -105,8 +127,11 @@ def measure_recording(
 
 def _is_measured(recording: Recording, model: mujoco.MjModel) -> bool:
     """Return whether a recording has all joints of the model, or must have them because it is suspended."""
-    joints = {model.joint(number).name for number in range(model.njnt)}
-    return joints <= set(recording.joint_angles) or recording.kind == "suspended"
+    return _joints(model) <= set(recording.joint_angles) or recording.kind == "suspended"
+
+
+def _joints(model: mujoco.MjModel) -> set[str]:
+    return {model.joint(number).name for number in range(model.njnt)}
 
 
 def identify_declared(
@@ -139,7 +164,7 @@ def identify_declared(
     config, sampling, validation = config or FitConfig(), sampling or SamplingConfig(), validation or {}
     check_fit_config(config)
     check_sampling_config(sampling)
-    specimen = check_recordings(robot, {**recordings, **validation}, config.window_seconds)
+    specimen = check_recordings(robot, recordings, validation, config.window_seconds, sampling)
     model = robot.load_model()
     parameters = declared_parameters(robot, model)
     if earlier is not None:

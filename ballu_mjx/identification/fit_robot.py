@@ -23,7 +23,7 @@ from ballu_mjx.identification.bounded_solver import bounded_least_squares
 from ballu_mjx.identification.measured_motion import MeasuredMotion
 from ballu_mjx.identification.parameters import Direction, IdentifiedParameters, ParameterSet
 from ballu_mjx.identification.uncertainty import analyse
-from ballu_mjx.identification.window_objective import WindowConfig, WindowObjective, WindowSearch
+from ballu_mjx.identification.window_objective import WindowConfig, WindowObjective, WindowSearch, robust_scatter
 from ballu_mjx.identification.window_simulator import Windows, WindowSimulator, cut_windows
 
 
@@ -50,6 +50,12 @@ def check_fit_config(config: FitConfig) -> None:
     for name in ("window_seconds", "interval_seconds", "starts", "steps", "outlying"):
         if getattr(config, name) is not None and getattr(config, name) <= 0:
             raise InputError(f"--{name.replace('_', '-')} is {getattr(config, name)}: it must be above 0.")
+    if config.interval_seconds is not None and config.interval_seconds < config.window_seconds:
+        raise InputError(
+            f"--interval-seconds is {config.interval_seconds:g}, less than --window-seconds "
+            f"({config.window_seconds:g}): windows would share samples, and standard errors would be too small; give "
+            "windows that do not overlap."
+        )
     if config.start_spread < 0:
         raise InputError(
             f"--start-spread is {config.start_spread}: it must be 0 or more; 0 takes starting states as measured."
@@ -261,7 +267,7 @@ def fit_robot(
         directions=analysis.directions,
         unseen=visibility.unseen,
         at_bounds=parameters.at_bounds(values),
-        scatter=objective.scale,
+        scatter=robust_scatter(best.residuals[..., : objective.simulator.nv]),
         losses=np.sort(losses),
         windows=windows,
         nominal=pair[0],

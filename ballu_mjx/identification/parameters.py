@@ -253,8 +253,8 @@ class ParameterSet:
 
     @property
     def in_drivetrain(self) -> np.ndarray:
-        """Return a mask of the parameters that belong to the drivetrain, not to the model."""
-        return np.array([all(isinstance(t, CommandTarget) for t in p.targets) for p in self.parameters], bool)
+        """Return a mask of the parameters that change the drivetrain. Ties may also change the model."""
+        return np.array([any(isinstance(t, CommandTarget) for t in p.targets) for p in self.parameters], bool)
 
     @property
     def friction_dofs(self) -> np.ndarray:

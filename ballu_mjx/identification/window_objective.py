@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from ballu_mjx.identification.window_simulator import Simulated, WindowSimulator
+from ballu_mjx.identification.window_simulator import DIVERGED, Simulated, WindowSimulator
 
 
 @dataclasses.dataclass(frozen=True)
@@ -100,6 +100,7 @@ class WindowObjective:
 
 def robust_scatter(differences: Float[np.ndarray, "windows samples channels"]) -> Float[np.ndarray, " channels"]:
     """Return each channel's robust standard deviation, in units of its noise, and at least 1."""
+    differences = np.nan_to_num(differences, nan=DIVERGED, posinf=DIVERGED, neginf=-DIVERGED)
     return np.maximum(1.0, _NORMAL * np.median(np.abs(differences), axis=(0, 1)))
 
 

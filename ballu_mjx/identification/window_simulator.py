@@ -163,7 +163,7 @@ class WindowSimulator:
             found.append([x[:kept] for x in self._linear(*points, *(x[rows] for x in self._held))])
         value, jacobian = (np.concatenate(parts) for parts in zip(*found, strict=True))
         diverged = ~(np.isfinite(value).all(axis=(1, 2)) & np.isfinite(jacobian).all(axis=(1, 2, 3)))
-        value[diverged], jacobian[diverged] = _DIVERGED, 0.0
+        value[diverged], jacobian[diverged] = DIVERGED, 0.0
         return Simulated(value, jacobian[..., :size], jacobian[..., size:])
 
     def _linearized(
@@ -271,7 +271,7 @@ class WindowSimulator:
 
 _CHUNK = 1024
 """Largest number of windows times directions that are simulated in parallel."""
-_DIVERGED = 1e3
+DIVERGED = 1e3
 """Difference assigned to a window that diverged, in units of noise."""
 
 

@@ -86,6 +86,11 @@ def write_fields(spec: mujoco.MjSpec, wanted: mujoco.MjModel) -> None:
     moved = {
         int(row) for field in _INERTIAL for row in np.argwhere(getattr(base, field) != getattr(wanted, field))[:, 0]
     }
+    compiler, automatic = spec.compiler, mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_AUTO
+    if moved and (compiler.inertiafromgeom != automatic or compiler.settotalmass > 0):
+        # With these settings the compiler would replace or scale the values below.
+        compiler.inertiafromgeom, compiler.settotalmass = automatic, -1.0
+        moved = set(range(1, base.nbody))
     for body in spec.bodies:
         if body.id in moved:
             body.explicitinertial = True

@@ -178,7 +178,7 @@ def test_stability_is_checked_for_the_actuators_in_use(tmp_path: Path, diverges:
         (["--actuators", "{training}"], "this is a folder; give the file actuators.json"),
         (["--actuators", "missing.json"], "missing.json: there is no such file; `python -m ballu_mjx.train sysid`"),
         (["--validation", "{training}"], "is among --recordings and --validation"),
-        (["--window-seconds", "60"], "no recording lasts 60 s"),
+        (["--window-seconds", "60"], "none of --recordings lasts 60 s"),
     ],
 )
 def test_unsuitable_options_and_recordings_are_refused(

@@ -17,7 +17,7 @@ from ballu_mjx.identification.fit_report import fit_table, intervals
 from ballu_mjx.identification.fit_robot import FitConfig, RobotFit, analyse, check_data, fit_robot, replay
 from ballu_mjx.identification.measured_motion import MeasuredMotion, SamplingConfig, measure
 from ballu_mjx.identification.parameters import Parameter, ParameterSet
-from ballu_mjx.identification.window_objective import ReducedResiduals, soften
+from ballu_mjx.identification.window_objective import ReducedResiduals, robust_scatter, soften
 from ballu_mjx.identification.window_simulator import WindowSimulator, cut_windows
 from ballu_mjx.recordings.csv_format import read_recording
 from ballu_mjx.robots.description import RobotDescription
@@ -212,9 +212,17 @@ def test_softening_keeps_small_differences_and_flattens_large_ones():
     np.testing.assert_allclose(derivatives, change, atol=1e-6)
 
 
+def test_diverged_windows_do_not_make_the_scatter_undefined():
+    differences = np.random.default_rng(0).normal(size=(20, 30, 2))
+    differences[0] = np.nan
+    np.testing.assert_allclose(robust_scatter(3 * differences), robust_scatter(3 * differences[1:]), rtol=0.1)
+
+
 def test_fit_refuses_unsuitable_input(motions: list[MeasuredMotion], parameters: ParameterSet, tmp_path: Path):
     with pytest.raises(InputError, match="No recording lasts 60 s"):
         fit_robot(parameters, motions, None, FitConfig(window_seconds=60.0))
+    with pytest.raises(InputError, match="--interval-seconds is 0.2, less than --window-seconds"):
+        fit_robot(parameters, motions, None, FitConfig(window_seconds=0.5, interval_seconds=0.2))
     with pytest.raises(InputError, match="--starts is 0"):
         check_data(parameters, motions, FitConfig(starts=0))
     description, _, model = robot(tmp_path)

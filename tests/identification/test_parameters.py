@@ -221,6 +221,14 @@ FAULTS = {
     "no such command": ({"command": "middle", "field": "delay"}, "names 'middle', which is no command"),
     "a mass by its field": ({"body": "arm", "field": "body_mass"}, "there are mass, com, inertia, mass_properties"),
     "prior": ({"joint": "left", "field": "damping", "prior": 0}, "write a number above 0"),
+    "bounds of one number": ({"joint": "left", "field": "damping", "bounds": 3}, "write two numbers"),
+    "nominal of a body": ({"body": "arm", "field": "mass", "nominal": 0.25}, 'has "nominal", which follows'),
+    "bounds of a body": ({"body": "arm", "field": "mass", "bounds": [1, 2]}, "exclude the nominal 0.4"),
+    "negative mass": ({"body": "arm", "field": "mass", "bounds": [-1, 1]}, "mass must be above 0"),
+    "no such key of a target": (
+        {"targets": [{"joint": "left", "field": "damping", "facotr": 2}]},
+        'a target with the key "facotr"',
+    ),
     "bounds of ten": ({"body": "arm", "field": "mass_properties", "bounds": [0, 1]}, "leave it out"),
 }
 
@@ -230,6 +238,12 @@ def test_errors_in_declarations_name_file_and_entry(tmp_path: Path, fault: str):
     entry, message = FAULTS[fault]
     with pytest.raises(InputError, match=rf'arm\.robot\.json: "identify" .*{message}'):
         arm(tmp_path, entry)
+
+
+def test_a_tie_of_command_and_model_changes_both(tmp_path: Path):
+    ties = [{"command": "left", "field": "scale"}, {"actuator": "servo_left", "field": "strength"}]
+    parameters, _ = arm(tmp_path, {"targets": ties}, {"joint": "left", "field": "damping"})
+    np.testing.assert_array_equal(parameters.in_drivetrain, [True, False])
 
 
 def test_repeated_and_missing_declarations_are_refused(tmp_path: Path):

@@ -103,3 +103,36 @@ def test_an_identified_spring_reference_of_a_model_in_degrees_is_written_back(tm
     description = robot(tmp_path, "door", DOOR, {"joint": "hinge", "field": "springref", "bounds": [-1, 1]})
     written = mujoco.MjModel.from_xml_string(identified_xml(description, values(description, 0.2)))
     np.testing.assert_allclose(written.qpos_spring, [0.2], rtol=1e-5)
+
+
+GEOMETRIC = """
+<mujoco>
+  <compiler SETTING autolimits="true"/>
+  <worldbody>
+    <body name="door">
+      <joint name="hinge" axis="0 1 0"/>
+      <inertial pos="0.01 0 0" mass="1" diaginertia="0.003 0.002 0.004"/>
+      <geom type="box" size="0.3 0.02 0.4" mass="0.5"/>
+      <site name="door"/>
+      <body name="knob" pos="0.25 0 0">
+        <joint name="knob" axis="0 1 0"/>
+        <inertial pos="0 0 0" mass="0.2" diaginertia="0.0003 0.0002 0.0004"/>
+        <geom type="sphere" size="0.03" mass="0.1"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor name="motor" joint="hinge" ctrlrange="-1 1"/></actuator>
+</mujoco>
+"""
+
+
+@pytest.mark.filterwarnings("ignore:compiler attribute 'settotalmass' is deprecated:UserWarning")
+@pytest.mark.parametrize("setting", ["", 'inertiafromgeom="true"', 'settotalmass="3"'])
+def test_identified_masses_are_written_whatever_the_compiler_does_to_masses(tmp_path: Path, setting: str) -> None:
+    description = robot(tmp_path, "door", GEOMETRIC.replace("SETTING", setting), {"body": "BODY", "field": "mass"})
+    identified = values(description, 0.7)
+    written = mujoco.MjModel.from_xml_string(identified_xml(description, identified))
+    wanted = description.load_model(identified)
+    assert wanted.body_mass[1] == pytest.approx(0.7)
+    for field in ("body_mass", "body_ipos", "body_inertia"):
+        np.testing.assert_allclose(getattr(written, field), getattr(wanted, field), rtol=1e-4, atol=1e-9)
