@@ -110,7 +110,7 @@ def of_the_model_itself(seeds: int, draws: int) -> dict[str, Table]:
         worst = np.maximum(worst, np.abs(found - vectors).max(axis=0))
     relative = np.where(space.relative, worst / vectors.min(axis=0), worst)
     units = [
-        "of the value" if own else "m" if "slack" in name else "rad"
+        "of the value" if own else {"cable_slack": "m", "motor_travel": "of the nominal one"}.get(name, "rad")
         for name, own in zip(LEG_PARAMETERS, space.relative, strict=True)
     ]
     errors = [
