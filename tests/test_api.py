@@ -20,6 +20,7 @@ import tethered
 import ballu_mjx as bm
 from ballu_mjx.ballu.leg_parameters import IdentificationConfig
 from ballu_mjx.recordings.recording import cut
+from ballu_mjx.robots.model import assets
 from ballu_mjx.runs.layout import RUN_FORMAT
 from ballu_mjx.runs.record import MemoryRecord
 
@@ -137,6 +138,14 @@ def test_training_in_memory_and_in_a_folder_are_equal(flights: list[bm.Motion], 
     assert kept.step == written.step
     jax.tree.map(np.testing.assert_array_equal, kept.params, written.params)
     assert [row["step"] for row in memory.metrics if "validation_error" in row] == [0, 160, 320]
+
+
+def test_the_legs_of_another_model_are_not_identified_as_ballus(tmp_path: Path):
+    for name in ("ballu.robot.json", "ballu.xml"):
+        (tmp_path / name).write_text((assets() / name).read_text().replace('model="ballu"', 'model="other"'))
+    other = bm.load_robot(str(tmp_path / "ballu.robot.json"))
+    with pytest.raises(bm.InputError, match="needs the bundled model"):
+        bm.identify_actuators(bm.load_recordings("suspended", bm.load_robot("ballu")), other)
 
 
 def test_bundled_recordings_and_sweeps_are_refused_for_other_robots(tmp_path: Path):

@@ -146,14 +146,13 @@ def prepare(
     **Raises** `InputError` for recordings, actuators or a base residual that cannot be used. The message names them.
     """
     robot = load_chosen_robot(data.robot, resume, task, base or earlier)
-    residual = None if base is None else TrainedResidual.load(base, robot)
+    before = {run: TrainedResidual.load(run, robot) for run in (base, earlier) if run is not None}
+    residual = None if base is None else before[base]
     dataset = ResidualDataset.read(data, robot, resume)
-    for run in (base, earlier):
-        if run is not None:
-            learned_with = TrainedResidual.load(run, robot).actuators
-            if dataset.undecided:
-                dataset = dataset.with_actuators(learned_with, f"those of {run}")
-            dataset.check_learned_with(learned_with, run)
+    for run, learned in before.items():
+        if dataset.undecided:
+            dataset = dataset.with_actuators(learned.actuators, f"those of {run}")
+        dataset.check_learned_with(learned.actuators, run)
     folder = resume or new_folder(data.output if first else None, task)
     if first:
         _announce(dataset, folder, data.quick)

@@ -1,6 +1,7 @@
 """`train sysid` for a robot that declares parameters, and the use of the result by other commands."""
 
 import contextlib
+import dataclasses
 import io
 import json
 import re
@@ -16,8 +17,11 @@ from ballu_mjx.cli import train
 from ballu_mjx.cli._residual import prepare
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.identification.actuators import ACTUATORS_FILE, read_actuators, validation_ratio
+from ballu_mjx.identification.declared import check_recordings
+from ballu_mjx.identification.measured_motion import SamplingConfig
 from ballu_mjx.identification.parameters import IdentifiedParameters
 from ballu_mjx.identification.write_back import identified_to_json
+from ballu_mjx.recordings.csv_format import list_recordings, read_recording
 from ballu_mjx.residuals.dataset import RecordingsData
 from ballu_mjx.residuals.run_config import describe_run, run_actuators
 from ballu_mjx.robots.description import RobotDescription, read_description
@@ -190,6 +194,20 @@ def test_unsuitable_options_and_recordings_are_refused(
     assert train.main([*line, *(a.format(training=folder / "training") for a in arguments)]) == 2
     assert message in capsys.readouterr().err
     assert not (folder / "refused").exists()
+
+
+def test_recordings_of_one_identification_have_the_same_kind_of_states(robot: RobotDescription):
+    training, held = (
+        {path: read_recording(path, robot) for path in list_recordings([robot.file.parent / use])}
+        for use in ("training", "validation")
+    )
+    bare = {path: dataclasses.replace(recording, joint_angles={}) for path, recording in held.items()}
+    check_recordings(robot, training, held, 1.0, SamplingConfig(angle_noise=0.01))
+    check_recordings(robot, bare, {}, 1.0, SamplingConfig())
+    with pytest.raises(InputError, match="motion-1.*no columns for elbow, shoulder, but .*motion-0.* has all joints"):
+        check_recordings(robot, training, bare, 1.0, SamplingConfig())
+    with pytest.raises(InputError, match="leave out the options of sampling"):
+        check_recordings(robot, bare, {}, 1.0, SamplingConfig(angle_noise=0.01))
 
 
 @pytest.mark.parametrize("option", [("--window-seconds", "2"), ("--actuators", "swept.json")])
