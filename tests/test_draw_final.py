@@ -82,7 +82,11 @@ def test_draw_is_refused_unless_the_tagged_commit_is_checked_out_unchanged(
     assert not (tmp_path / "final.json").exists()
 
 
-@pytest.mark.parametrize("path", sorted((ROOT / "results").glob("final*.json")), ids=lambda path: path.name)
+# `final_KIND.json` are tables.
+SEEDS = [path for path in sorted((ROOT / "results").glob("final*.json")) if not path.name.startswith("final_")]
+
+
+@pytest.mark.parametrize("path", SEEDS, ids=lambda path: path.name)
 def test_published_seeds_are_those_of_their_commit(path: Path) -> None:
     stored = json.loads(path.read_text())
     assert stored["format"] == draw_final.FORMAT
