@@ -92,13 +92,13 @@ def rows(folders: Sequence[Path]) -> list[Row]:
     names = [name for name in options[0] if all(name in each for each in options)]
     differing = [name for name in names if len({each.get(name) for each in options}) > 1]
     found: dict[str, list[Path]] = {}
-    seeds: dict[str, set[Any]] = {}
+    taken: set[tuple[str, Any]] = set()
     for folder, config, each in zip(folders, configs, options, strict=True):
         label = ", ".join(f"{name} {each[name]}" for name in differing) or configs[0]["task"]
         seed = next((config[section]["seed"] for section in ("ppo", "fit") if "seed" in config.get(section, {})), None)
-        if seed in seeds.setdefault(label, set()):
+        if (label, seed) in taken:
             label = f"{label} ({folder})"  # a repeated run is no other sample
-        seeds.setdefault(label, set()).add(seed)
+        taken.add((label, seed))
         found.setdefault(label, []).append(folder)
     return [Row(label, tuple(members)) for label, members in found.items()]
 

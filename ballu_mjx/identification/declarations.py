@@ -85,7 +85,9 @@ def parameters_of(
 
 
 _ELEMENTS = ("joint", "actuator", "tendon", "geom", "body", "command")
-_KEYS = (*_ELEMENTS, "field", "index", "factor", "targets", "name", "unit", "nominal", "bounds", "prior")
+_TARGET_KEYS = ("field", "index", "factor")
+"""Keys of a target besides that of its element."""
+_KEYS = (*_ELEMENTS, *_TARGET_KEYS, "targets", "name", "unit", "nominal", "bounds", "prior")
 _FIELDS: Mapping[str, Mapping[str, str]] = {
     "joint": {
         "damping": "dof_damping",
@@ -154,10 +156,6 @@ _SPREAD = 0.3
 """Default prior standard deviation, relative to the nominal value."""
 _RADIUS = 0.5
 """Default bound on the shift of a body's centre of mass, relative to its radius of gyration, and on its shears."""
-
-
-_TARGET_KEYS = ("field", "index", "factor")
-"""Keys of a target besides that of its element."""
 
 
 class _Declaration:
@@ -350,10 +348,8 @@ class _Declaration:
         bounds = (-reach, reach) if nominal == 0 else (nominal / _FACTOR, nominal * _FACTOR)
         for key in ("nominal", "unit", *(("bounds", "prior") if group else ())):
             if key in self.entry:
-                problem = (
-                    f'has "{key}" for several parameters' if group else f'has "{key}", which follows from the model'
-                )
-                self.refuse(problem, "leave it out")
+                why = " for several parameters" if group else ", which follows from the model"
+                self.refuse(f'has "{key}"{why}', "leave it out")
         if not group:
             bounds = self._bounds(bounds, nominal)
         if nominal > 0 and bounds[0] <= 0:
