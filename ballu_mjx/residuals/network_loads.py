@@ -63,6 +63,8 @@ def check_load_options(config: ForceNetworkConfig, robot: RobotDescription) -> N
         raise InputError(
             f"--scales is for --forces joints and --forces commands: with --forces {config.forces}, give --force-scale."
         )
+    if config.torque_scale is not None and config.forces != "wrench":
+        raise InputError(f"--torque-scale is for --forces wrench: leave it out with --forces {config.forces}.")
     if count not in (0, size):
         raise InputError(
             f"--scales has {count} values: give {size} with --forces {config.forces}, or leave it out for the default."

@@ -410,7 +410,7 @@ def _observe(
         data = mjx.com_vel(model, mjx.com_pos(model, mjx.kinematics(model, data)))
         return observe_features(data, *ids), shares @ data.xipos
 
-    return vmap_with_trailing_batch(seen)(model, template, state, shares)
+    return vmap_with_trailing_batch(seen, key=("observe", sites))(model, template, state, shares)
 
 
 _CHUNK = 1024

@@ -130,7 +130,7 @@ def control_step(
         state: PhysicsState,
         commands: Float[Array, "count commands"],
         wrench: Float[Array, "loaded 6"],
-    ) -> PhysicsState:
+    ) -> tuple[Array, ...]:
         # Wrenches are added one by one, because two points may belong to the same body.
         applied = template.xfrc_applied
         for number, body in enumerate(bodies):
@@ -147,9 +147,12 @@ def control_step(
             now = loaded.replace(ctrl=commands[number])  # pyright: ignore
             return physics_step(model, now, state, at_points if points else None)
 
-        return jax.lax.fori_loop(0, count, step, state)
+        return tuple(jax.lax.fori_loop(0, count, step, state))
 
-    return vmap_with_trailing_batch(steps, has_dry_friction(model))(model, template, state, commands, wrench)
+    key = "control_step", bodies, points, count
+    return PhysicsState(
+        *vmap_with_trailing_batch(steps, has_dry_friction(model), key)(model, template, state, commands, wrench)
+    )
 
 
 def has_dry_friction(model: mjx.Model) -> bool:

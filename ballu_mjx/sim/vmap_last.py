@@ -19,11 +19,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
+from jax.custom_batching import custom_vmap
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jax.interpreters.partial_eval import dce_jaxpr
 from jaxtyping import Array, PyTree
 
 from ballu_mjx.sim.custom_jvp import directional_derivative, nonzero_tangents
+from ballu_mjx.sim.program_cache import cached_program, shapes_of
 from ballu_mjx.sim.vmap_last_rules import Batch, Batched, depends_on_batch, evaluate, unwrap
 
 
@@ -105,24 +107,31 @@ def nested_vmap(function: Callable[..., PyTree], inner: int = 1, store_operands:
     return whole
 
 
-def vmap_with_trailing_batch(function: Callable[..., PyTree], store_operands: bool = False) -> Callable[..., PyTree]:
+def vmap_with_trailing_batch(
+    function: Callable[..., PyTree], store_operands: bool = False, key: tuple[Any, ...] | None = None
+) -> Callable[..., PyTree]:
     """Return `function` with a rule that makes `jax.vmap` put the batch along the last axis.
 
     The rule applies to forward derivatives too. It exists on the CPU only: on other devices, the result calls
-    `function` unchanged. Reverse mode is not supported. `store_operands`: see `vmap_last_rules.Batch`; true for models
-    with dry friction (`step.has_dry_friction`).
+    `function` unchanged. Reverse mode is not supported.
+
+    **Arguments**
+
+    - `store_operands`: see `vmap_last_rules.Batch`; true for models with dry friction (`step.has_dry_friction`).
+    - `key`: name and static values that determine `function`. Its traced programs are then stored on disk, except those
+      of derivatives (`program_cache`). It must return arrays in tuples or lists. If None, nothing is stored.
     """
 
     def whole(*arguments: PyTree) -> PyTree:
         if jax.default_backend() != "cpu":
             return function(*arguments)
         leaves, tree = jax.tree.flatten(arguments)
-
+        stored = None if key is None else (*key, tree, store_operands)
         flat = _recorded(lambda leaves: function(*jax.tree.unflatten(tree, leaves)), leaves)
 
         @jax.custom_jvp
         def apply(*leaves: Array) -> PyTree:
-            return _with_batch_last(flat, store_operands)(list(leaves))
+            return _with_batch_last(flat, store_operands, stored)(list(leaves))
 
         @functools.partial(apply.defjvp, symbolic_zeros=True)
         def _(leaves: Sequence[Array], changes: Sequence[Any]) -> tuple[PyTree, PyTree]:
@@ -143,20 +152,75 @@ def vmap_with_trailing_batch(function: Callable[..., PyTree], store_operands: bo
 def _recorded(function: Callable[..., PyTree], *arguments: PyTree) -> Callable[..., PyTree]:
     """Return a function that runs JAX's record of `function` for arguments of these shapes.
 
-    Tracing MJX takes long, and it would be traced several times here. Operations that the results do not need, a third
-    of a physics step, are left out.
+    The record is made at the first call. Tracing MJX takes long, and it would be traced several times here. Operations
+    that the results do not need, a third of a physics step, are left out.
     """
-    record, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
-    needed, _ = dce_jaxpr(record.jaxpr, [True] * len(record.jaxpr.outvars), instantiate=True)
-    run, tree = jaxpr_as_fun(ClosedJaxpr(needed, record.consts)), jax.tree.structure(shape)
-    return lambda *arguments: jax.tree.unflatten(tree, run(*jax.tree.leaves(arguments)))
+    shapes = shapes_of(arguments)
+
+    @functools.cache
+    def recorded() -> tuple[Callable[..., list[Array]], Any]:
+        record, shape = jax.make_jaxpr(function, return_shape=True)(*shapes)
+        needed, _ = dce_jaxpr(record.jaxpr, [True] * len(record.jaxpr.outvars), instantiate=True)
+        return jaxpr_as_fun(ClosedJaxpr(needed, record.consts)), jax.tree.structure(shape)
+
+    def run(*arguments: PyTree) -> PyTree:
+        flat, tree = recorded()
+        return jax.tree.unflatten(tree, flat(*jax.tree.leaves(arguments)))
+
+    return run
 
 
-def _with_batch_last(function: Callable[..., PyTree], store_operands: bool) -> Callable[..., PyTree]:
-    whole = jax.custom_batching.custom_vmap(function)
+def _with_batch_last(
+    function: Callable[..., PyTree], store_operands: bool, key: tuple[Any, ...] | None = None
+) -> Callable[..., PyTree]:
+    """Return `function` with the rule of `vmap_with_trailing_batch`."""
 
-    @whole.def_vmap
-    def _(size: int, in_batched: Sequence[PyTree[bool]], *arguments: PyTree) -> tuple[PyTree, PyTree[bool]]:
-        return vmap(function, in_batched, size, store_operands=store_operands)(*arguments)
+    def run(*arguments: PyTree) -> PyTree:
+        whole = custom_vmap(function if key is None else cached_program(key, function, arguments))
 
-    return whole
+        @whole.def_vmap
+        def _(size: int, in_batched: Sequence[PyTree[bool]], *arguments: PyTree) -> tuple[PyTree, PyTree[bool]]:
+            batched = vmap(function, in_batched, size, store_operands=store_operands)
+            if key is None:
+                return batched(*arguments)
+            which = size, tuple(jax.tree.leaves(in_batched))
+            return _unmarked(_stored(batched, size, store_operands, (*key, *which), arguments)(*arguments))
+
+        return whole(*arguments)
+
+    return run
+
+
+def _stored(
+    batched: Callable[..., tuple[PyTree, PyTree[bool]]],
+    size: int,
+    store_operands: bool,
+    key: tuple[Any, ...],
+    arguments: Sequence[PyTree],
+) -> Callable[..., PyTree]:
+    """Return the stored program of a batched function. Its results are marked as with a batch or without.
+
+    A further `jax.vmap` cannot batch a stored program. It batches the function.
+    """
+
+    def marked(*arguments: PyTree) -> PyTree:
+        return jax.tree.map(lambda x, d: {_BATCHED if d else _SHARED: x}, *batched(*arguments))
+
+    program = custom_vmap(cached_program(key, marked, arguments))
+
+    @program.def_vmap
+    def _(outer: int, in_batched: Sequence[PyTree[bool]], *arguments: PyTree) -> tuple[PyTree, PyTree[bool]]:
+        return vmap(marked, in_batched, outer, max(_WIDEST // size, 1), store_operands)(*arguments)
+
+    return program
+
+
+_BATCHED, _SHARED = "batched", "shared"
+
+
+def _unmarked(found: PyTree) -> tuple[PyTree, PyTree[bool]]:
+    def is_mark(x: Any) -> bool:
+        return isinstance(x, dict)
+
+    results = jax.tree.map(lambda x: next(iter(x.values())), found, is_leaf=is_mark)
+    return results, jax.tree.map(lambda x: _BATCHED in x, found, is_leaf=is_mark)

@@ -14,10 +14,13 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.core import ShapedArray
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
 from jaxtyping import Array
+
+from ballu_mjx.sim.constant_folding import fold, is_constant
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,8 +70,18 @@ def _ranked(array: Array, like: Array) -> Array:
     return array if array.ndim == like.ndim else lax.broadcast_in_dim(array, like.shape, (like.ndim - 1,))
 
 
-def evaluate(closed: ClosedJaxpr, arguments: Iterable[Any], batch: Batch) -> list[Any]:
-    """Return the results of a recorded function."""
+Operations = dict[Any, tuple[list[Any], list[Any]]]
+"""Inputs and results of the operations so far. Inputs are kept because a key contains their identities."""
+
+
+def evaluate(
+    closed: ClosedJaxpr, arguments: Iterable[Any], batch: Batch, operations: Operations | None = None
+) -> list[Any]:
+    """Return the results of a recorded function. Repeated operations are evaluated once.
+
+    `operations` are those of the function that calls this one.
+    """
+    operations = {} if operations is None else operations
     known: dict[Any, Any] = dict(zip(closed.jaxpr.constvars, closed.consts, strict=True))
     known.update(zip(closed.jaxpr.invars, arguments, strict=True))
 
@@ -76,18 +89,40 @@ def evaluate(closed: ClosedJaxpr, arguments: Iterable[Any], batch: Batch) -> lis
         return variable.val if isinstance(variable, Literal) else known[variable]
 
     for equation in closed.jaxpr.eqns:
-        results = _apply(equation, [read(v) for v in equation.invars], batch)
+        inputs, call = [read(v) for v in equation.invars], _CALLS.get(equation.primitive.name)
+        if call is not None:
+            results = evaluate(equation.params[call], inputs, batch, operations)
+        else:
+            key = _operation(equation, inputs)
+            if key not in operations:
+                operations[key] = inputs, _apply(equation, inputs, batch)
+            results = operations[key][1]
         known.update(zip(equation.outvars, results, strict=True))
     return [read(v) for v in closed.jaxpr.outvars]
+
+
+def _operation(equation: JaxprEqn, inputs: list[Any]) -> Any:
+    """Return a key that is equal for equal operations on the same inputs, or on constants of equal content."""
+    places = tuple(_content(x) if is_constant(x) else id(x) for x in inputs)
+    try:
+        params = tuple(sorted(equation.params.items()))
+        hash(params)
+    except TypeError:
+        params = id(equation)
+    return equation.primitive, places, params
+
+
+def _content(value: Any) -> Any:
+    array = np.asarray(value)
+    return array.tobytes(), array.shape, array.dtype
 
 
 def _apply(equation: JaxprEqn, inputs: list[Any], batch: Batch) -> list[Any]:
     """Return the results of one operation."""
     name, bind, params = equation.primitive.name, equation.primitive.bind, equation.params
-    if name in _CALLS:
-        return evaluate(params[_CALLS[name]], inputs, batch)
     if not any(map(_is_batched, inputs)):
-        return _as_list(bind(*inputs, **params), equation)
+        constant = fold(equation, inputs)
+        return _as_list(bind(*inputs, **params), equation) if constant is None else [constant]
     if name in _ELEMENTWISE:
         full = [_full(x, batch) for x in inputs]
         widest = max(full, key=jnp.ndim)

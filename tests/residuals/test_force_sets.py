@@ -172,6 +172,7 @@ def test_expected_loads_are_one_for_all_or_one_for_each(robot: RobotDescription)
         ({"expected_loads": (1.0, 2.0, 3.0)}, "--expected-loads has 3 values: give 2 with --forces joints"),
         ({"scales": (0.5,)}, "--scales has 1 values: give 2 with --forces joints"),
         ({"forces": "wrench"}, "with --forces wrench, give --force-scale"),
+        ({"torque_scale": 0.1}, "--torque-scale is for --forces wrench"),
     ],
 )
 def test_scales_and_expected_loads_that_do_not_fit_the_robot_are_refused(

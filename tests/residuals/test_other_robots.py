@@ -38,7 +38,7 @@ from ballu_mjx.sim.observation import HISTORY, ObservationLayout
 from ballu_mjx.sim.simulator import Simulator
 
 SIMULATOR = Simulator(ROBOT)
-CONFIG = EnvMimicConfig(forces="force", force_scale=0.05, torque_scale=0.005, force_limit=1.0, force_cost=20.0)
+CONFIG = EnvMimicConfig(forces="force", force_scale=0.05, force_limit=1.0, force_cost=20.0)
 PRIORS = SupervisedConfig(force_spread=0.3, force_change=0.1, torque_spread=0.05)
 NETWORK = PPOConfig(policy_layers=(16,), value_layers=(4,))
 
