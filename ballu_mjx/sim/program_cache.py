@@ -42,24 +42,35 @@ def cached_program(
 
     - `key`: values that determine `function`: numbers, strings, arrays, tree structures, and tuples of these. If a
       value is of another kind, return `function` itself.
-    - `function`: maps arrays in tuples, lists and dicts to the same.
+    - `function`: maps arrays in tuples, lists and dicts to the same. If it has an operation without a portable form,
+      return `function` itself.
     """
     folder = jax.config.jax_compilation_cache_dir  # pyright: ignore
     shapes = shapes_of(tuple(arguments))
-    leaves, tree = jax.tree.flatten(shapes)
-    name = _hash((_versions(), _precision(), key, tree, tuple((x.shape, x.dtype.name) for x in leaves)))
+    name = program_name(key, shapes)
     if not folder or name is None:
         return function
     path = Path(folder) / _FOLDER / f"{name}.jax"
     content = _read(path)
     if content is None:
-        program = export.export(jax.jit(function))(*shapes)
-        content = bytes(program.serialize())
+        try:
+            content = bytes(export.export(jax.jit(function))(*shapes).serialize())
+        except (ValueError, NotImplementedError):  # an operation without a portable form
+            return function
         with contextlib.suppress(OSError):  # without a writable folder, the next process traces it again
             path.parent.mkdir(parents=True, exist_ok=True)
             files.write(path, hashlib.sha256(content).digest() + content)
     _load_lapack()
     return export.deserialize(bytearray(content)).call
+
+
+def program_name(key: tuple[Any, ...], shapes: Sequence[PyTree]) -> str | None:
+    """Return a hash of a `key` (see `cached_program`), of the shapes and types of arguments, and of all versions.
+
+    None if a value in the key is of an unknown kind.
+    """
+    leaves, tree = jax.tree.flatten(shapes)
+    return _hash((_versions(), _precision(), key, tree, tuple((x.shape, x.dtype.name) for x in leaves)))
 
 
 def _read(path: Path) -> bytes | None:

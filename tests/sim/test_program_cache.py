@@ -114,6 +114,14 @@ def test_what_cannot_be_stored_is_computed(folder: Path):
     np.testing.assert_array_equal(cached_program(unknown, Traced(2.0), (X, Y))(X, Y)[0], 2 * X + Y)
 
 
+def test_what_has_no_portable_form_is_computed(folder: Path):
+    def function(x: Any) -> Any:
+        return jax.pure_callback(lambda x: 2 * np.asarray(x), jax.ShapeDtypeStruct(x.shape, x.dtype), x)
+
+    np.testing.assert_array_equal(cached_program(("function",), function, (X,))(X), 2 * X)
+    assert not list(folder.rglob("*.jax"))
+
+
 _SOLVE = """
 import sys
 
