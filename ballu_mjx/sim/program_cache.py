@@ -36,7 +36,7 @@ def cached_program(
 ) -> Callable[..., PyTree]:
     """Return `function` for arguments like `arguments`, from the disk if its program is there. Store it otherwise.
 
-    If JAX's compilation cache is off, return `function` itself.
+    If JAX's compilation cache is off or not a local folder, return `function` itself.
 
     **Arguments**
 
@@ -45,12 +45,11 @@ def cached_program(
     - `function`: maps arrays in tuples, lists and dicts to the same. If it has an operation without a portable form,
       return `function` itself.
     """
-    folder = jax.config.jax_compilation_cache_dir  # pyright: ignore
-    shapes = shapes_of(tuple(arguments))
+    folder, shapes = _cache_folder(), shapes_of(tuple(arguments))
     name = program_name(key, shapes)
-    if not folder or name is None:
+    if folder is None or name is None:
         return function
-    path = Path(folder) / _FOLDER / f"{name}.jax"
+    path = folder / f"{name}.jax"
     content = _read(path)
     if content is None:
         try:
@@ -62,6 +61,14 @@ def cached_program(
             files.write(path, hashlib.sha256(content).digest() + content)
     _load_lapack()
     return export.deserialize(bytearray(content)).call
+
+
+def _cache_folder() -> Path | None:
+    config: Any = jax.config
+    folder = config.jax_compilation_cache_dir
+    if not folder or not config.jax_enable_compilation_cache or "://" in folder:
+        return None
+    return Path(folder) / _FOLDER
 
 
 def program_name(key: tuple[Any, ...], shapes: Sequence[PyTree]) -> str | None:

@@ -114,6 +114,22 @@ def test_what_cannot_be_stored_is_computed(folder: Path):
     np.testing.assert_array_equal(cached_program(unknown, Traced(2.0), (X, Y))(X, Y)[0], 2 * X + Y)
 
 
+@pytest.mark.parametrize(
+    ("option", "value"), [("jax_compilation_cache_dir", "gs://bucket/cache"), ("jax_enable_compilation_cache", False)]
+)
+def test_nothing_is_stored_without_a_local_cache(
+    folder: Path, option: str, value: Any, monkeypatch: pytest.MonkeyPatch
+):
+    monkeypatch.chdir(folder)
+    before = getattr(jax.config, option)
+    jax.config.update(option, value)
+    try:
+        np.testing.assert_array_equal(cached_program(("function",), Traced(2.0), (X, Y))(X, Y)[0], 2 * X + Y)
+    finally:
+        jax.config.update(option, before)
+    assert not list(folder.iterdir())
+
+
 def test_what_has_no_portable_form_is_computed(folder: Path):
     def function(x: Any) -> Any:
         return jax.pure_callback(lambda x: 2 * np.asarray(x), jax.ShapeDtypeStruct(x.shape, x.dtype), x)
