@@ -46,7 +46,8 @@ def cached_program(
       return `function` itself.
     """
     folder, shapes = _cache_folder(), shapes_of(tuple(arguments))
-    name = program_name(key, shapes)
+    leaves, tree = jax.tree.flatten(shapes)
+    name = _hash((_versions(), _precision(), key, tree, tuple((x.shape, x.dtype.name) for x in leaves)))
     if folder is None or name is None:
         return function
     path = folder / f"{name}.jax"
@@ -69,15 +70,6 @@ def _cache_folder() -> Path | None:
     if not folder or not config.jax_enable_compilation_cache or "://" in folder:
         return None
     return Path(folder) / _FOLDER
-
-
-def program_name(key: tuple[Any, ...], shapes: Sequence[PyTree]) -> str | None:
-    """Return a hash of a `key` (see `cached_program`), of the shapes and types of arguments, and of all versions.
-
-    None if a value in the key is of an unknown kind.
-    """
-    leaves, tree = jax.tree.flatten(shapes)
-    return _hash((_versions(), _precision(), key, tree, tuple((x.shape, x.dtype.name) for x in leaves)))
 
 
 def _read(path: Path) -> bytes | None:

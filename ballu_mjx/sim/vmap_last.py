@@ -11,7 +11,6 @@ Operations without a rule (`vmap_last_rules`) are left to `jax.vmap`, which is e
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -26,7 +25,7 @@ from jax.interpreters.partial_eval import dce_jaxpr
 from jaxtyping import Array, PyTree
 
 from ballu_mjx.sim.custom_jvp import directional_derivative, nonzero_tangents
-from ballu_mjx.sim.program_cache import cached_program, program_name, shapes_of
+from ballu_mjx.sim.program_cache import cached_program, shapes_of
 from ballu_mjx.sim.vmap_last_rules import Batch, Batched, depends_on_batch, evaluate, unwrap
 
 
@@ -128,7 +127,7 @@ def vmap_with_trailing_batch(
             return function(*arguments)
         leaves, tree = jax.tree.flatten(arguments)
         stored = None if key is None else (*key, tree, store_operands)
-        flat = _recorded(lambda leaves: function(*jax.tree.unflatten(tree, leaves)), leaves, key=stored)
+        flat = _recorded(lambda leaves: function(*jax.tree.unflatten(tree, leaves)), leaves)
 
         @jax.custom_jvp
         def apply(*leaves: Array) -> PyTree:
@@ -150,48 +149,25 @@ def vmap_with_trailing_batch(
     return whole
 
 
-def _recorded(
-    function: Callable[..., PyTree], *arguments: PyTree, key: tuple[Any, ...] | None = None
-) -> Callable[..., PyTree]:
+def _recorded(function: Callable[..., PyTree], *arguments: PyTree) -> Callable[..., PyTree]:
     """Return a function that runs JAX's record of `function` for arguments of these shapes.
 
-    The record is made at the first call. Tracing MJX takes long, and it would be traced several times here. If `key`
-    determines the function, the record is kept for later calls with an equal key and equal shapes.
+    The record is made at the first call. Tracing MJX takes long, and it would be traced several times here. Operations
+    that the results do not need, a third of a physics step, are left out.
     """
     shapes = shapes_of(arguments)
-    name = None if key is None else program_name(key, shapes)
-    recording = _Recording(function, shapes, object() if name is None else name)
-    kept = _record if name is not None else functools.cache(_record.__wrapped__)
+
+    @functools.cache
+    def recorded() -> tuple[Callable[..., list[Array]], Any]:
+        record, shape = jax.make_jaxpr(function, return_shape=True)(*shapes)
+        needed, _ = dce_jaxpr(record.jaxpr, [True] * len(record.jaxpr.outvars), instantiate=True)
+        return jaxpr_as_fun(ClosedJaxpr(needed, record.consts)), jax.tree.structure(shape)
 
     def run(*arguments: PyTree) -> PyTree:
-        flat, tree = kept(recording)
+        flat, tree = recorded()
         return jax.tree.unflatten(tree, flat(*jax.tree.leaves(arguments)))
 
     return run
-
-
-@dataclasses.dataclass(frozen=True)
-class _Recording:
-    """A function to be recorded. Equal names mean equal functions and shapes."""
-
-    function: Callable[..., PyTree] = dataclasses.field(compare=False)
-    shapes: PyTree = dataclasses.field(compare=False)
-    name: Any
-
-
-_RECORDS = 16
-"""Number of records that are kept."""
-
-
-@functools.lru_cache(_RECORDS)
-def _record(recording: _Recording) -> tuple[Callable[..., list[Array]], Any]:
-    """Return the recorded function, from and to lists of arrays, and the structure of its results.
-
-    Operations that the results do not need, a third of a physics step, are left out.
-    """
-    record, shape = jax.make_jaxpr(recording.function, return_shape=True)(*recording.shapes)
-    needed, _ = dce_jaxpr(record.jaxpr, [True] * len(record.jaxpr.outvars), instantiate=True)
-    return jaxpr_as_fun(ClosedJaxpr(needed, record.consts)), jax.tree.structure(shape)
 
 
 def _with_batch_last(

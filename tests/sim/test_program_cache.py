@@ -71,16 +71,6 @@ def test_other_shapes_types_and_batches_are_other_programs(folder: Path):
     np.testing.assert_array_equal(together[0], 2 * X + 2)
 
 
-def test_a_process_traces_a_function_once_for_all_batches(folder: Path):
-    times = []
-    for size in (1, 2, 4):
-        function = Traced(5.0)
-        found = jax.jit(jax.vmap(function.kept(("once",)), in_axes=(0, None)))(X[:size], Y)
-        np.testing.assert_array_equal(found[0], 5 * X[:size] + Y)
-        times.append(function.times)
-    assert times == [1, 0, 0]
-
-
 def test_results_without_a_batch_stay_so(folder: Path):
     for _ in range(2):
         each = jax.vmap(Traced(2.0).kept(), in_axes=(0, None), out_axes=(0, None))
