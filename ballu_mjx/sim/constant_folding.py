@@ -18,9 +18,8 @@ from jaxtyping import Shaped
 Constant = Shaped[np.ndarray, "..."]
 _LARGEST = 4096
 """Largest number of elements of a result. Larger constants would make programs larger, not smaller."""
-
-
 _KINDS = np.ndarray | np.generic | jax.Array | int | float
+"""Types of constants. A `Tracer` is a `jax.Array`, too."""
 
 
 def is_constant(value: Any) -> bool:

@@ -45,10 +45,13 @@ def cached_program(
     - `function`: maps arrays in tuples, lists and dicts to the same. If it has an operation without a portable form,
       return `function` itself.
     """
-    folder, shapes = _cache_folder(), shapes_of(tuple(arguments))
+    folder = _cache_folder()
+    if folder is None:
+        return function
+    shapes = shapes_of(tuple(arguments))
     leaves, tree = jax.tree.flatten(shapes)
     name = _hash((_versions(), _precision(), key, tree, tuple((x.shape, x.dtype.name) for x in leaves)))
-    if folder is None or name is None:
+    if name is None:
         return function
     path = folder / f"{name}.jax"
     content = _read(path)
