@@ -13,7 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.program_cache import cached_program
+from ballu_mjx.sim.simulator import Simulator
+from ballu_mjx.sim.step import state_at
 from ballu_mjx.sim.vmap_last import vmap_with_trailing_batch
 
 
@@ -136,6 +139,19 @@ def test_what_has_no_portable_form_is_computed(folder: Path):
 
     np.testing.assert_array_equal(cached_program(("function",), function, (X,))(X), 2 * X)
     assert not list(folder.rglob("*.jax"))
+
+
+def test_a_robot_s_step_and_observation_are_stored(folder: Path):
+    """All static fields of a model can be hashed. Otherwise nothing would be stored, without a word."""
+    jax.clear_caches()  # other tests may have traced the same programs
+    simulator = Simulator(load_robot())
+    state = state_at(jnp.zeros((3, simulator.mj_model.nq)), jnp.zeros((3, simulator.nv)))
+    for count, function in (
+        (2, jax.vmap(simulator.observe)),
+        (4, jax.vmap(lambda state: simulator.step(state, jnp.zeros(2), jnp.zeros((1, 6))))),
+    ):
+        jax.eval_shape(function, state)
+        assert len(list(folder.rglob("*.jax"))) == count
 
 
 _SOLVE = """
