@@ -123,8 +123,8 @@ class Options(loggers.LoggingOptions):
     push_torque: float = 0.0
     """Standard deviation of the random constant torques (N m), like --push-force."""
     quick: bool = False
-    """Run every stage for one task and two simulators, in three minutes with a full cache of compiled programs and
-    eight with an empty one (two cores). The tables then mean nothing."""
+    """Run every stage for one task and two simulators, in two minutes with a full cache of compiled programs and
+    five with an empty one (two cores). The tables then mean nothing."""
 
 
 def run(options: Options) -> int:

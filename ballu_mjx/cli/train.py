@@ -22,7 +22,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return the exit status (`runtime.exit_status`)."""
 
     def run() -> int:
-        runtime.prepare()
+        # Short trainings spend most of their time on compiling.
+        runtime.prepare(brief="--quick" in (sys.argv[1:] if arguments is None else arguments))
         from ballu_mjx.cli._command import run_command
 
         description = (

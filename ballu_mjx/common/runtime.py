@@ -20,9 +20,10 @@ import re
 import sys
 import textwrap
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+from ballu_mjx.common.compiler_options import OLDER_FUSION
 from ballu_mjx.common.errors import InputError
 
 _DEVICE_COUNT_FLAG = "--xla_force_host_platform_device_count"
@@ -37,8 +38,10 @@ _M_ARENA_MAX = -8
 """Option of glibc's `mallopt` for the largest number of heaps."""
 
 
-def prepare() -> None:
+def prepare(*, brief: bool = False) -> None:
     """Configure JAX for this process, then import MJX. Call this function before anything else imports JAX.
+
+    If `brief` is true, programs compile in less time and run longer (`compiler_options.OLDER_FUSION`).
 
     - The CPU is split into one host device per core. XLA does not spread these small operations over cores, but a
       batch that is sharded over host devices uses all of them. A device count in the user's `XLA_FLAGS` is kept, and
@@ -63,7 +66,8 @@ def prepare() -> None:
     `InputError` from `check_jax`.
     """
     if "jax" not in sys.modules:
-        os.environ["XLA_FLAGS"] = _with_flags(os.environ.get("XLA_FLAGS", ""), _cores(), _cpu_description())
+        fusion = OLDER_FUSION if brief else {}
+        os.environ["XLA_FLAGS"] = _with_flags(os.environ.get("XLA_FLAGS", ""), _cores(), _cpu_description(), fusion)
         if not _accelerated():
             os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
         if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
@@ -189,14 +193,15 @@ def _error_message(error: Exception) -> str:
     return f"This is a fault of ballu_mjx, not of your input: {what}; run again with --debug and report it."
 
 
-def _with_flags(flags: str, count: int, cpu: str) -> str:
-    """Return XLA's `flags` with `count` host devices, and with vectors of 512 bits if `cpu` (its description) has them.
+def _with_flags(flags: str, count: int, cpu: str, options: Mapping[str, bool]) -> str:
+    """Return XLA's `flags` with `options` and `count` host devices, and with vectors of 512 bits if the CPU has them.
 
-    Options that `flags` already set are not changed.
+    `cpu` is the CPU's description. Options that `flags` already set are not changed.
     """
-    wanted = {_DEVICE_COUNT_FLAG: count}
+    wanted = {_DEVICE_COUNT_FLAG: str(count)}
+    wanted |= {f"--{name}": str(value).lower() for name, value in options.items()}
     if re.search(r"\bavx512f\b", cpu):
-        wanted[_VECTOR_WIDTH_FLAG] = 512
+        wanted[_VECTOR_WIDTH_FLAG] = "512"
     return " ".join([flags, *(f"{flag}={value}" for flag, value in wanted.items() if flag not in flags)]).strip()
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from ballu_mjx.common import runtime
+from ballu_mjx.common.compiler_options import OLDER_FUSION
 from ballu_mjx.common.errors import InputError
 
 SET_BY_PREPARE = (
@@ -95,8 +96,22 @@ def test_nothing_is_printed_with_a_cold_or_a_warm_cache(tmp_path: Path) -> None:
     [("", "fma avx2 avx512f", "512"), ("", "fma avx2", None), ("--xla_cpu_prefer_vector_width=128", "avx512f", "128")],
 )
 def test_vectors_of_512_bits_are_used_on_cpus_with_avx512(flags: str, cpu: str, width: str | None) -> None:
-    found = re.findall(r"--xla_cpu_prefer_vector_width=(\d+)", runtime._with_flags(flags, 2, cpu))
+    found = re.findall(r"--xla_cpu_prefer_vector_width=(\d+)", runtime._with_flags(flags, 2, cpu, {}))
     assert found == ([] if width is None else [width])
+
+
+@pytest.mark.skipif(not OLDER_FUSION, reason="this version of XLA does not have the older fusion")
+@pytest.mark.parametrize(
+    ("brief", "chosen", "values"),
+    [(True, "", ["false"]), (False, "", []), (True, "--xla_cpu_use_fusion_emitters=true", ["true"])],
+)
+def test_brief_runs_compile_with_the_older_fusion_unless_the_user_chose(
+    tmp_path: Path, brief: bool, chosen: str, values: list[str]
+) -> None:
+    code = f"import os; from ballu_mjx.common import runtime; runtime.prepare(brief={brief}); "
+    code += "import jax; jax.jit(lambda: 0)(); print(os.environ['XLA_FLAGS'])"
+    done = python(code, tmp_path, XLA_FLAGS=chosen)
+    assert re.findall(r"--xla_cpu_use_fusion_emitters=(\w+)", done.stdout) == values
 
 
 def test_compiled_programs_are_stored_in_the_cache_folder(tmp_path: Path) -> None:
