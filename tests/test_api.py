@@ -91,6 +91,7 @@ def example() -> Example:
     return Example(printed=printed.getvalue(), **{name: left[name] for name in Example._fields if name != "printed"})
 
 
+@pytest.mark.slow
 def test_readme_example_prints_a_table_and_returns_a_policy(example: Example):
     _, *table = example.printed.splitlines()
     assert "vanilla+sysid" in example.printed and "aerodynamic" in example.printed and table
@@ -101,6 +102,7 @@ def test_readme_example_prints_a_table_and_returns_a_policy(example: Example):
     assert command.shape == (2,) and np.all((command >= 0) & (command <= 1))
 
 
+@pytest.mark.slow
 def test_evaluation_is_deterministic(example: Example):
     one, other = (bm.evaluate(example.sim.with_residual(example.air), example.motions) for _ in range(2))
     assert one == other
@@ -113,6 +115,7 @@ def flights() -> list[bm.Motion]:
     return [tethered.flight(seed=seed, added_mass=0.03) for seed in range(2)]
 
 
+@pytest.mark.slow
 def test_envmimic_on_top_of_aerodynamic_is_evaluated_with_both(flights: list[bm.Motion]):
     """A residual learned in an improved simulator is evaluated together with that simulator's residual."""
     simulator = bm.Simulator(tethered.ROBOT)
@@ -128,6 +131,7 @@ def test_envmimic_on_top_of_aerodynamic_is_evaluated_with_both(flights: list[bm.
         np.testing.assert_allclose(found.score, alone.score, rtol=0.2)
 
 
+@pytest.mark.slow
 def test_training_in_memory_and_in_a_folder_are_equal(flights: list[bm.Motion], tmp_path: Path):
     simulator = bm.Simulator(tethered.ROBOT)
     content = {"format": RUN_FORMAT, "task": "envmimic", "starts": [], "ppo": dataclasses.asdict(SIZES)}

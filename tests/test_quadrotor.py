@@ -257,6 +257,7 @@ def public(experiment: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> 
     return folder
 
 
+@pytest.mark.slow
 def test_a_known_wind_is_found_and_explains_the_flight(
     experiment: ModuleType, robot: RobotDescription, public: Path, tmp_path: Path
 ):

@@ -7,6 +7,7 @@ import time
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 import sysid_pendulum  # pyright: ignore[reportMissingImports]
 from searches import Search, compare, lbfgsb  # pyright: ignore[reportMissingImports]
 
@@ -51,6 +52,7 @@ def test_compile_clock_counts_compilation_once():
     assert clock.between(compiled, end) == 0
 
 
+@pytest.mark.slow
 def test_windows_in_c_mujoco_match_those_of_the_fit():
     robot = sysid_pendulum.read_pendulum()
     model = robot.load_model()

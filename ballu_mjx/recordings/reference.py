@@ -76,9 +76,10 @@ def pad_to_bucket(reference: ReferenceMotions) -> ReferenceMotions:
     )
 
     def filled(x: Array) -> Array:
-        return jnp.pad(x, [(0, more[0]), (0, more[1]), *[(0, 0)] * (x.ndim - 2)], mode="edge")
+        # In NumPy: JAX would compile a program for each size.
+        return jnp.asarray(np.pad(x, [(0, more[0]), (0, more[1]), *[(0, 0)] * (x.ndim - 2)], mode="edge"))
 
-    steps = jnp.pad(reference.steps, (0, more[0]))
+    steps = jnp.asarray(np.pad(reference.steps, (0, more[0])))
     return jax.tree.map(filled, reference._replace(steps=None))._replace(steps=steps)
 
 

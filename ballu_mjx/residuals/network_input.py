@@ -65,4 +65,4 @@ def recorded_inputs(
 
     steps = np.asarray(reference.steps)
     pairs = np.array([(r, k) for r, count in enumerate(steps) for k in range(HISTORY - 1, count)])
-    return jax.jit(jax.vmap(inputs))(*jnp.array(pairs).T)
+    return jax.jit(jax.vmap(inputs))(*pairs.T)

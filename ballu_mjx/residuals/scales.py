@@ -176,7 +176,7 @@ def missing_loads(
             effects.append((moved - after[here]) / change[here, None])
         loads = _solve_loads(root, np.stack(effects, axis=2), missing)
         if FORCE_SETS[forces].turns and heading_frame and not robot.anchored:
-            yaw = np.asarray(reference.features[number, here, ObservationLayout.yaw])
+            yaw = np.asarray(reference.features)[number, here, ObservationLayout.yaw]
             to_heading = Rotation.from_euler("z", -yaw[:, None]).as_matrix()
             loads = (loads.reshape(len(here), -1, 3) @ to_heading.swapaxes(1, 2)).reshape(len(here), -1)
         found.append(loads)

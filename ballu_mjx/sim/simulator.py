@@ -128,12 +128,15 @@ class Simulator:
         One compiled program serves all numbers of states.
         """
         shape, count = qpos.shape[:-1], math.prod(qpos.shape[:-1])
-        flat = state_at(qpos.reshape(count, -1), qvel.reshape(count, -1))
-        parts = [PhysicsState(*(x[rows] for x in flat)) for rows, _ in chunks(count, _CHUNK)]
+        # In NumPy: JAX would compile a program for each slice and size.
+        positions, velocities = (np.asarray(x).reshape(count, -1) for x in (qpos, qvel))
+        states = [
+            state_at(jnp.asarray(positions[rows]), jnp.asarray(velocities[rows])) for rows, _ in chunks(count, _CHUNK)
+        ]
         fixed = self._mass_shares, self._sites
-        pieces = [_observe_chunk(self.model, self._template, part, *fixed) for part in parts]
-        features, com = (jnp.concatenate(parts)[:count] for parts in zip(*pieces, strict=True))
-        return features.reshape(*shape, -1), com.reshape(*shape, -1)
+        pieces = [_observe_chunk(self.model, self._template, state, *fixed) for state in states]
+        features, com = (np.concatenate(parts)[:count] for parts in zip(*pieces, strict=True))
+        return jnp.asarray(features.reshape(*shape, -1)), jnp.asarray(com.reshape(*shape, -1))
 
     def drivetrain_at_rest(self, command: Float[Array, " commands"]) -> DrivetrainState | None:
         """Return the drivetrain's state after a long time under a constant command. None if there is no drivetrain."""

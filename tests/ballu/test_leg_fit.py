@@ -126,6 +126,7 @@ def c_model(side: str, values: np.ndarray) -> mujoco.MjModel:
     return model
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", [HIGH, LOW])
 @pytest.mark.parametrize("side", SIDES)
 def test_settled_angles_are_the_angles_at_rest_in_c_mujoco(
@@ -143,6 +144,7 @@ def test_settled_angles_are_the_angles_at_rest_in_c_mujoco(
     assert np.rad2deg(ours) == pytest.approx(np.rad2deg(expected), abs=0.02)
 
 
+@pytest.mark.slow
 def test_motion_matches_c_mujoco_with_friction_backlash_lag_and_delay(physics: CompiledLeg) -> None:
     values = vector(LOW)
     paths = moving(physics, vector(HIGH), values)[1]
@@ -169,6 +171,7 @@ def test_motion_matches_c_mujoco_with_friction_backlash_lag_and_delay(physics: C
     assert np.sqrt(np.mean(difference**2)) < 0.05 and difference.max() < 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", [HIGH, LOW])
 def test_derivatives_of_settled_angles_match_finite_differences(physics: CompiledLeg, change: list[float]) -> None:
     """At low commands, the cable is slack and the knee at its stop. At high ones, it is taut. LOW's servo saturates."""
@@ -188,6 +191,7 @@ def test_derivatives_of_settled_angles_match_finite_differences(physics: Compile
         assert derivative[..., index] == pytest.approx(difference[..., index], abs=1e-4 * scale + 1e-6), name
 
 
+@pytest.mark.slow
 def test_derivatives_of_the_motion_match_finite_differences(physics: CompiledLeg) -> None:
     """The left leg's servo never saturates. The right leg's servo does."""
     y = with_dynamics(vector(HIGH), vector(LOW))
@@ -218,6 +222,7 @@ def test_a_free_servo_is_stable_up_to_twice_the_largest_gain(factor: float, stay
     assert (abs(reached - np.pi / 4) < 0.01) == stays
 
 
+@pytest.mark.slow
 def test_motions_of_the_stiffest_servos_have_usable_derivatives(physics: CompiledLeg) -> None:
     """The servo of the right leg saturates. Derivatives grow to 1e20 and more at twice the largest gain."""
     gain, limit, cable = (LEG_PARAMETERS.index(name) for name in ("motor_gain", "torque_limit", "cable_stiffness"))
@@ -229,6 +234,7 @@ def test_motions_of_the_stiffest_servos_have_usable_derivatives(physics: Compile
     assert np.abs(derivatives).max() < 100.0
 
 
+@pytest.mark.slow
 def test_an_unstable_motion_turns_searches_back_and_is_no_result(
     noiseless: Sweep, identifier: Identifier, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -251,6 +257,7 @@ def test_an_unstable_motion_turns_searches_back_and_is_no_result(
         analyse_legs(residuals, y, kept, residuals.spread(y))
 
 
+@pytest.mark.slow
 def test_a_parameter_at_its_bound_has_the_standard_error_of_its_prior(noiseless: Sweep, identifier: Identifier) -> None:
     residuals, gain = identifier.residuals(noiseless), LEG_PARAMETERS.index("motor_gain")
     y = with_dynamics(*TRUTH)
@@ -262,6 +269,7 @@ def test_a_parameter_at_its_bound_has_the_standard_error_of_its_prior(noiseless:
     assert analyses[0].standard_errors[gain] == pytest.approx(SPACE.prior[gain] * LARGEST_GAIN, rel=0.01)
 
 
+@pytest.mark.slow
 def test_all_legs_within_the_bounds_come_to_rest(physics: CompiledLeg) -> None:
     draws = SPACE.draw(1, 40)
     qpos, _ = physics.settled(draws, np.tile(COMMANDS, (len(draws), 1)))
@@ -436,6 +444,7 @@ def test_only_the_motion_separates_friction_and_backlash_from_motor_zero(
     assert max(zero_error[True]) < np.deg2rad(0.3) < min(zero_error[False])
 
 
+@pytest.mark.slow
 def test_open_directions_are_reported_and_held_near_nominal(physics: CompiledLeg, identifier: Identifier) -> None:
     """Settled angles show no torque limit of servos that never saturate, although the motion does.
 
@@ -462,6 +471,7 @@ def test_open_directions_are_reported_and_held_near_nominal(physics: CompiledLeg
             ]
 
 
+@pytest.mark.slow
 def test_hausdorff_fit_has_a_lower_paper_objective_than_pointwise_fit(noiseless: Sweep, identifier: Identifier) -> None:
     sweep = dataclasses.replace(
         noiseless, settled=noiseless.settled + np.random.default_rng(0).normal(size=(20, 2, 2)) * np.deg2rad(1.0)

@@ -162,6 +162,7 @@ def test_trial_continues_unchanged_from_its_true_state(virtual: virtual_robot.Vi
     assert np.abs(other - qpos[ends]).max() > 0.05
 
 
+@pytest.mark.slow
 def test_capture_has_the_stated_noise_and_dropouts(virtual: virtual_robot.VirtualRobot):
     commands = np.zeros((400, 2))
     trial = virtual_robot.draw_trial(7)
@@ -212,6 +213,7 @@ def test_symmetric_robot_mirrors_its_walk_under_mirrored_commands():
     assert np.abs(left[-1, 0] - left[0, 0]) > 0.01
 
 
+@pytest.mark.slow
 def test_bundled_recording_is_reproduced_bit_for_bit(tmp_path: Path):
     job = dataset.jobs()[0]
     path = dataset.record_job(job, VirtualHardware.draw(dataset.ROBOT_SEED), tmp_path)

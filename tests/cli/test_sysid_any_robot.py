@@ -69,6 +69,7 @@ def test_guide_shows_the_files_that_the_example_writes(tmp_path: Path):
     assert (tmp_path / "validation" / "motion-2.csv").exists()
 
 
+@pytest.mark.slow
 def test_sysid_identifies_the_arm_and_writes_all_files(robot: RobotDescription, run: tuple[Path, str]):
     folder, printed = run
     name, found = read_actuators(robot, folder / ACTUATORS_FILE)
@@ -95,6 +96,7 @@ def test_sysid_identifies_the_arm_and_writes_all_files(robot: RobotDescription, 
     assert any("search" in json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines())
 
 
+@pytest.mark.slow
 def test_refinement_keeps_earlier_values_that_the_recordings_do_not_show(
     robot: RobotDescription, tmp_path: Path, capsys: pytest.CaptureFixture
 ):
@@ -127,6 +129,7 @@ def dataset(robot: RobotDescription, **options: Path) -> RecordingsData:
     return RecordingsData(**parts, output=folder / "out", **options)  # pyright: ignore[reportArgumentType]
 
 
+@pytest.mark.slow
 def test_identified_actuators_are_used_by_default_if_they_replay_better(
     robot: RobotDescription, run: tuple[Path, str], capsys: pytest.CaptureFixture
 ):

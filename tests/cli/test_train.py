@@ -112,11 +112,13 @@ def trained(stopped: Stopped) -> Path:
     return stopped.folder
 
 
+@pytest.mark.slow
 def test_interrupted_run_prints_how_to_resume_it(stopped: Stopped):
     assert "--resume run" in stopped.error and "Traceback" not in stopped.error
     assert stopped.step == stopped.rows[-1]["step"] > 0
 
 
+@pytest.mark.slow
 def test_resumed_run_continues_at_the_interrupted_step(stopped: Stopped, trained: Path):
     rows, total = read_metrics(trained), stopped.step + 2 * STEPS
     assert rows[: len(stopped.rows)] == stopped.rows
@@ -130,6 +132,7 @@ def test_resumed_run_continues_at_the_interrupted_step(stopped: Stopped, trained
     assert restore_checkpoint(trained, "last")[0] == total
 
 
+@pytest.mark.slow
 def test_run_folder_is_complete(trained: Path):
     for name in ("evaluation.txt", "evaluation.json", "learning_curve.png", "tracking.png", "replay.npz"):
         assert (trained / name).stat().st_size > 500, name
@@ -144,6 +147,7 @@ def test_run_folder_is_complete(trained: Path):
     assert [Path(entry["path"]).name for entry in config["recordings"]["test"]] == ["far-2.csv", "near-1.csv"]
 
 
+@pytest.mark.slow
 def test_evaluate_reproduces_the_errors_of_the_training_run(trained: Path):
     done = command("evaluate", "run", "--noise-floor", "--output", "again", folder=trained.parent)
     assert done.returncode == 0, done.stderr
@@ -169,6 +173,7 @@ def identified(folder: Path) -> Path:
     return folder / "identified"
 
 
+@pytest.mark.slow
 def test_sysid_reduces_the_error_on_the_sweep_and_writes_actuators(identified: Path):
     assert (identified / "actuator_curves.png").stat().st_size > 10_000
     name, parameters = read_actuators(identified / ACTUATORS_FILE)
@@ -190,6 +195,7 @@ def test_bundled_actuators_come_from_the_bundled_sweep():
     assert sources == [describe_recording(p) for p in list_bundled("suspended")]
 
 
+@pytest.mark.slow
 def test_envmimic_uses_identified_actuators_beside_the_recordings(trained: Path):
     stored = json.loads((trained / "config.json").read_text())["actuators"]
     assert stored == json.loads((trained.parent / "data" / ACTUATORS_FILE).read_text())["parameters"]
@@ -259,6 +265,7 @@ def test_wrong_path_is_refused_in_one_sentence(folder: Path):
     assert not (folder / "runs").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
@@ -285,6 +292,7 @@ def test_unsuitable_input_is_refused_in_one_sentence(trained, monkeypatch, capsy
     assert sentence in error and error.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_evaluate_refuses_a_changed_recording(trained, monkeypatch, capsys):
     monkeypatch.chdir(trained.parent)
     path = Path("data/near-1.csv")

@@ -31,6 +31,7 @@ def undisturbed(at: Trainer) -> Path:
     return at.work / "undisturbed"
 
 
+@pytest.mark.slow
 def test_killed_and_resumed_training_equals_an_undisturbed_one(at: Trainer, undisturbed: Path):
     random = np.random.default_rng(0)
     moments = [(int(random.integers(first, 20)), random.uniform(0.0, 0.2)) for first in (campaign.EVERY + 1, 1, 1)]
@@ -47,6 +48,7 @@ def test_killed_and_resumed_training_equals_an_undisturbed_one(at: Trainer, undi
     assert campaign.same(folder, undisturbed), moments
 
 
+@pytest.mark.slow
 def test_repeated_training_is_equal_to_the_bit(at: Trainer, undisturbed: Path):
     at.finish(at.work / "again")
     assert campaign.same(at.work / "again", undisturbed)
@@ -71,6 +73,7 @@ def test_second_process_is_refused_until_the_first_has_ended(at: Trainer):
         pass
 
 
+@pytest.mark.slow
 def test_damaged_last_checkpoint_is_detected(undisturbed: Path, tmp_path: Path, capsys):
     """Each file of it in turn is truncated, or one of its bits is flipped. The reader returns the checkpoint as it was
     written, or the one before it."""
@@ -96,6 +99,7 @@ def test_damaged_last_checkpoint_is_detected(undisturbed: Path, tmp_path: Path, 
     assert detected > 10
 
 
+@pytest.mark.slow
 def test_training_resumes_from_the_checkpoint_before_a_damaged_one(at: Trainer, undisturbed: Path):
     folder = at.work / "damaged"
     shutil.copytree(undisturbed, folder)
@@ -111,6 +115,7 @@ def test_training_resumes_from_the_checkpoint_before_a_damaged_one(at: Trainer, 
     )
 
 
+@pytest.mark.slow
 def test_exchanged_checkpoints_are_not_restored(undisturbed: Path, tmp_path: Path, capsys):
     """The folders of the checkpoints are exchanged, but none of their files is changed."""
     shutil.copytree(undisturbed / "checkpoints", tmp_path / "checkpoints")
@@ -123,6 +128,7 @@ def test_exchanged_checkpoints_are_not_restored(undisturbed: Path, tmp_path: Pat
     assert f"the checkpoint is that of step {steps[-2]}" in message_text and message_text.count("\n") == 2
 
 
+@pytest.mark.slow
 def test_full_disk_ends_training_with_a_message_and_loses_nothing(at: Trainer, undisturbed: Path):
     with campaign.small_disk(at.work, campaign.DISK) as disk:
         if disk is None:
@@ -145,6 +151,7 @@ def test_run_ends_with_a_message_if_measurements_cannot_be_written(tmp_path: Pat
     assert message_text.startswith(f"{folder}: its disk is full; make room there, then ") and then in message_text
 
 
+@pytest.mark.slow
 def test_message_says_that_every_checkpoint_is_damaged(undisturbed: Path, tmp_path: Path):
     shutil.copytree(undisturbed / "checkpoints", tmp_path / "checkpoints")
     for record in (tmp_path / "checkpoints").glob("*/record.json"):

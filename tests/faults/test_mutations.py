@@ -25,6 +25,7 @@ from ballu_mjx.runs.layout import RUN_FORMAT
 from ballu_mjx.viz import report_content
 
 
+@pytest.mark.slow
 def test_damaged_files_are_refused_by_name_or_valid_for_their_format():
     table, wrong = mutations.campaign(250, seed=1)
     assert not wrong, "\n".join(wrong)
@@ -102,6 +103,7 @@ def read_all(folder: Path) -> None:
             continue
 
 
+@pytest.mark.slow
 def test_no_file_in_a_run_s_folder_runs_code(run: Path, tmp_path: Path, found_classes: list[str]):
     """Each file of a received folder in turn is replaced by a pickle, or by a NumPy file that contains pickles."""
     created = tmp_path / "created"

@@ -151,6 +151,7 @@ def test_fit_names_a_torque_limit_that_no_recording_reaches(parameters: Paramete
     np.testing.assert_allclose(fit.standard_errors[place], 5.0, rtol=0.02)
 
 
+@pytest.mark.slow
 def test_derivatives_agree_with_finite_differences(motions: list[MeasuredMotion], parameters: ParameterSet):
     values = np.array([0.12, 0.08, 3.2, 0.36, 0.0333, 20.0])
     with jax.enable_x64(True):
@@ -170,6 +171,7 @@ def test_derivatives_agree_with_finite_differences(motions: list[MeasuredMotion]
         np.testing.assert_allclose(found.by_start[..., 0], change / 2e-4, atol=0.02)
 
 
+@pytest.mark.slow
 def test_fit_with_fixed_starting_states_returns_the_best_point_tried(
     motions: list[MeasuredMotion], parameters: ParameterSet
 ):
@@ -192,6 +194,7 @@ def test_fit_with_fixed_starting_states_returns_the_best_point_tried(
     np.testing.assert_allclose(held.by_parameters, free.by_parameters, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_motion_with_its_own_model_is_simulated_with_that_model(
     motions: list[MeasuredMotion], parameters: ParameterSet
 ):

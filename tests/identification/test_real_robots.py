@@ -79,6 +79,7 @@ def test_motor_parameters_from_three_loads_predict_a_fourth_load(monkeypatch: py
     assert mean[1] < 1.5 < mean[0]
 
 
+@pytest.mark.slow
 @needs_real_data
 def test_identified_parameters_predict_the_double_pendulum(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.syspath_prepend(REAL / "double_pendulum")

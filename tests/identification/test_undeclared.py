@@ -18,6 +18,8 @@ from ballu_mjx.recordings.csv_format import read_recording
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.registry import load_robot
 
+pytestmark = pytest.mark.slow
+
 NOISE, FRICTION = 0.3, 1.0
 """Noise of the measured angles, and largest offset from its target at which dry friction holds a joint (deg)."""
 CONFIG = FitConfig(window_seconds=0.6, starts=1)

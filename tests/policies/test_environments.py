@@ -70,6 +70,7 @@ def test_every_task_is_registered_under_its_name():
     assert list(environments.NAMES.values()) == list(TASKS)
 
 
+@pytest.mark.slow
 def test_a_batch_resets_each_robot_alone_and_repeats_with_the_same_seed(batch: LocomotionBatch):
     rng = np.random.default_rng(0)
     actions = rng.uniform(-1, 1, (20, 4, 2))
@@ -89,9 +90,11 @@ def test_a_batch_resets_each_robot_alone_and_repeats_with_the_same_seed(batch: L
         np.testing.assert_array_equal(same, ~step.truncated)
 
 
+@pytest.mark.slow
 def test_the_residual_of_a_run_acts_in_its_environment(run: Path, rover: RobotDescription, batch: LocomotionBatch):
     simulator = load_simulator(run)
     assert simulator.residual is not None and simulator.robot.sha256 == rover.sha256
+    batch.reset(seed=0)
     found = batch.step(np.zeros((4, 2)))
     np.testing.assert_allclose(found.metrics["force"], 3.0, rtol=1e-3)
     with pytest.raises(InputError, match="has its own robot"):
@@ -100,6 +103,7 @@ def test_the_residual_of_a_run_acts_in_its_environment(run: Path, rover: RobotDe
         make_environment("fly", run=run)
 
 
+@pytest.mark.slow
 def test_gymnasium_makes_single_and_vector_environments_by_name(run: Path):
     gymnasium = pytest.importorskip("gymnasium")
     from gymnasium.utils.env_checker import check_env

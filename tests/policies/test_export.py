@@ -500,6 +500,7 @@ def test_policy_files_name_observations_and_commands(rover_policy: Path):
     assert len(props["outputs"]) == 2
 
 
+@pytest.mark.slow
 def test_check_runs_an_exported_policy_in_c_mujoco(
     rover_policy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ):
@@ -536,6 +537,7 @@ def altered(source: Path, copy: Path, file: str, change: Callable[[dict[str, Any
     return copy
 
 
+@pytest.mark.slow
 def test_check_detects_wrong_exports(rover_policy: Path, tmp_path: Path):
     """In turn, a weight, the order of observations, a scale, and a constant of the simulator are wrong."""
     right = check_policy(rover_policy, seconds=1.0)

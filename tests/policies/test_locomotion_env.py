@@ -70,6 +70,7 @@ def test_rewards_are_velocities_in_the_direction_of_the_task():
     assert rewards == pytest.approx({"walk": 0.3, "turn": -0.2, "turn-right": 0.2, "walk-backward": -0.3})
 
 
+@pytest.mark.slow
 def test_reward_is_the_mean_velocity_of_the_centre_of_mass_in_c_mujoco():
     state = RESET(PLAIN.setting, jax.random.key(0))
     data = mujoco.MjData(MODEL)
@@ -102,6 +103,7 @@ def test_observation_is_independent_of_position_and_includes_heading():
     np.testing.assert_allclose(other[-2:], [np.cos(seen[8] + yaw), np.sin(seen[8] + yaw)], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_randomization_of_friction_and_starting_state_is_off_by_default():
     keys = jax.random.split(jax.random.key(1), 200)
     draw = jax.jit(jax.vmap(PLAIN._start, in_axes=(None, 0)))
@@ -119,6 +121,7 @@ def test_randomization_of_friction_and_starting_state_is_off_by_default():
     assert (knees >= standing_qpos(MODEL)[7:][KNEES] - 1e-6).all()
 
 
+@pytest.mark.slow
 def test_lower_friction_lets_the_robot_slide_further():
     """A robot with a horizontal starting velocity slides further on a floor with lower friction."""
     state = RESET(PLAIN.setting, jax.random.key(0))
@@ -135,6 +138,7 @@ def test_lower_friction_lets_the_robot_slide_further():
     assert distances[0] > distances[1] + 0.02
 
 
+@pytest.mark.slow
 def test_pushes_are_drawn_anew_for_every_episode():
     keys = jax.random.split(jax.random.key(2), 400)
     draw = jax.jit(jax.vmap(PLAIN._start, in_axes=(None, 0)))
@@ -146,6 +150,7 @@ def test_pushes_are_drawn_anew_for_every_episode():
     np.testing.assert_allclose(spread, [0.02, 0.02, 0, 0, 0, 0.003], rtol=0.15)
 
 
+@pytest.mark.slow
 def test_a_push_acts_over_the_whole_episode_and_is_no_residual():
     """Two equal and opposite pushes move the robot apart by as much as C MuJoCo says. The next episode has another."""
     state = RESET(PLAIN.setting, jax.random.key(0))
@@ -169,6 +174,7 @@ def test_a_push_acts_over_the_whole_episode_and_is_no_residual():
     assert abs(expected[0][1] - expected[1][1]) > 0.2
 
 
+@pytest.mark.slow
 def test_identified_actuators_act_in_every_episode():
     nominal = ActuatorParameters.nominal(MODEL)
     weak = dataclasses.replace(nominal, torque_limit=nominal.torque_limit * jnp.array([0.1, 1.0]))
@@ -183,6 +189,7 @@ def test_identified_actuators_act_in_every_episode():
     assert left > 15 and abs(right) < left / 3
 
 
+@pytest.mark.slow
 def test_residual_force_has_its_units_and_is_in_the_heading_frame():
     action, yaw = np.array([0.5, 0.2, -0.1]), 2.0
     env = LocomotionEnv(BALLU, TASKS["walk"], LocomotionConfig(), residual=make_residual(action))
@@ -202,6 +209,7 @@ def test_residual_force_has_its_units_and_is_in_the_heading_frame():
     assert float(state.metrics["force"]) == pytest.approx(np.linalg.norm(force), rel=1e-5)
 
 
+@pytest.mark.slow
 def test_residual_force_fades_outside_its_training_range():
     history = jnp.zeros((HISTORY, 27)).at[-1, 2].set(2.0)  # only the balloon's height is out of range
     history = history.at[:-1].set(history[-1])
@@ -232,6 +240,7 @@ GAIN = ppo.Params(ppo.Normalizer(np.zeros(()), {}, {}, {}), None, np.float32(0.8
 """Parameters of policies that are not networks."""
 
 
+@pytest.mark.slow
 def test_residuals_of_one_kind_share_one_compiled_program():
     action, network = 3, PPOConfig(policy_layers=(4,), value_layers=(4,))
     infer = ppo.make_inference({ppo.STATE: (INPUTS,)}, action, network)
@@ -257,6 +266,7 @@ def test_residuals_of_one_kind_share_one_compiled_program():
     assert closed_loop[0] == closed_loop[1]
 
 
+@pytest.mark.slow
 def test_closed_loop_agrees_with_steps_of_the_environment():
     infer = lambda params, seen: params.value * jnp.sin(10 * seen[:2])  # noqa: E731
     env = LocomotionEnv(BALLU, TASKS["walk"], LocomotionConfig(domain_randomization=True))

@@ -97,6 +97,7 @@ def test_pushes_are_independent_of_the_starting_tilt(rover: RobotDescription):
     assert np.abs(together).max() < 0.1
 
 
+@pytest.mark.slow
 def test_policies_move_the_mass_that_identification_and_residual_give_together(tmp_path: Path):
     rover = write_rover(tmp_path)
     content = json.loads(rover.file.read_text())

@@ -47,6 +47,7 @@ def policy(tmp_path_factory: pytest.TempPathFactory) -> Policy:
     )
 
 
+@pytest.mark.slow
 def test_a_policy_moves_as_expected_in_its_own_simulator_and_otherwise_in_a_pushed_one(policy: Policy) -> None:
     plain = Simulator(policy.robot)
     push = BoundResidual(PlainPush(), jnp.asarray(20.0), None)  # friction holds about 12 N
@@ -59,6 +60,7 @@ def test_a_policy_moves_as_expected_in_its_own_simulator_and_otherwise_in_a_push
     assert found["same"].outside == 0.0
 
 
+@pytest.mark.slow
 def test_predicted_errors_combine_the_distance_to_the_best_simulator_with_its_error(
     policy: Policy, tmp_path: Path
 ) -> None:

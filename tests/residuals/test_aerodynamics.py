@@ -30,7 +30,7 @@ from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.observation import HISTORY, euler_to_matrix, heading_rotation
 from ballu_mjx.sim.simulator import Simulator
 
-pytestmark = pytest.mark.optimized
+pytestmark = [pytest.mark.optimized, pytest.mark.slow]
 
 SIMULATOR = Simulator(load_robot())
 MODEL = SIMULATOR.mj_model

@@ -197,6 +197,7 @@ def test_start_noise_stays_small_and_keeps_the_quaternion_a_unit(still: Motion):
     assert np.abs(hinges[:, 3]).max() == 0.0  # motors have no noise
 
 
+@pytest.mark.slow
 def test_time_limits_truncate_and_divergence_terminates(still: Motion):
     env = EnvMimicEnv(Simulator(load_robot()), [still], EnvMimicConfig(episode_seconds=0.4, start_noise=0.0))
     step = jax.jit(env.step)
@@ -220,6 +221,7 @@ def test_time_limits_truncate_and_divergence_terminates(still: Motion):
     assert all(np.isfinite(x).all() for x in state.obs.values()) and np.isfinite(float(state.reward))
 
 
+@pytest.mark.slow
 def test_the_missing_force_earns_more_reward_than_zero_or_opposite_force(pushed: Motion):
     """A constant force acts on the reference robot, so this test detects errors of sign and frame. Among the forces at
     balloon, base and feet, only the first is not zero."""
@@ -253,6 +255,7 @@ def test_the_missing_force_earns_more_reward_than_zero_or_opposite_force(pushed:
     assert total(force) > 20 * 0.99 * best
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("forces", ["force", "wrench"])
 def test_an_untrained_policy_gives_the_mean_force_that_the_model_lacks(forces: ForceSet):
     """A robot that lost lift lacks a constant force. Its recording is followed without training, and costs nothing."""
@@ -286,6 +289,7 @@ def evaluator() -> OpenLoopEvaluator:
     return OpenLoopEvaluator(Simulator(load_robot()), motions, constant)
 
 
+@pytest.mark.slow
 def test_evaluation_finds_errors_only_where_a_force_is_missing(evaluator: OpenLoopEvaluator):
     result = evaluator(jnp.array(FORCE))
     own, pushed = result.vanilla
@@ -297,6 +301,7 @@ def test_evaluation_finds_errors_only_where_a_force_is_missing(evaluator: OpenLo
     assert result.excess()[0] > 0 and "near-own" in result.excess()[1]
 
 
+@pytest.mark.slow
 def test_diverged_replays_are_counted_and_not_averaged(evaluator: OpenLoopEvaluator):
     evaluator(jnp.array(FORCE))  # The errors without residual are kept: a share of 0 of these parameters would be NaN.
     result = evaluator(jnp.full(3, jnp.nan))
@@ -308,6 +313,7 @@ def test_diverged_replays_are_counted_and_not_averaged(evaluator: OpenLoopEvalua
     assert "diverged" in result.table() and "nan" not in result.table() + json.dumps(evaluation_to_json(result)).lower()
 
 
+@pytest.mark.slow
 def test_far_away_robots_are_counted_as_diverged_without_a_warning(evaluator: OpenLoopEvaluator):
     """The square of 1e25 m has no value in single precision."""
     replay = evaluator.replay(jnp.array(FORCE))
@@ -316,6 +322,7 @@ def test_far_away_robots_are_counted_as_diverged_without_a_warning(evaluator: Op
         assert some == starts > 0
 
 
+@pytest.mark.slow
 def test_a_replay_of_limited_length_is_the_start_of_a_longer_one(evaluator: OpenLoopEvaluator):
     whole, short = (evaluator.replay(jnp.array(FORCE), seconds=seconds) for seconds in (np.inf, 1.0))
     states = 1 + round(1.0 / evaluator.robot.control_timestep)
@@ -323,6 +330,7 @@ def test_a_replay_of_limited_length_is_the_start_of_a_longer_one(evaluator: Open
     np.testing.assert_array_equal(short.position, whole.position[:, :states])
 
 
+@pytest.mark.slow
 def test_first_runs_last_to_the_recordings_end_and_others_to_the_longest_horizon(evaluator: OpenLoopEvaluator):
     shorter = copy.copy(evaluator)
     shorter.robot = dataclasses.replace(evaluator.robot, horizons=(0.5, 1.0))
@@ -339,6 +347,7 @@ def test_first_runs_last_to_the_recordings_end_and_others_to_the_longest_horizon
         assert limited.mean_com_error == pytest.approx(whole.mean_com_error)
 
 
+@pytest.mark.slow
 def test_evaluation_with_identified_actuators_includes_the_nominal_robot(evaluator: OpenLoopEvaluator):
     """The first recording is from the nominal robot, so it has no error only without the identified actuators."""
     assert evaluator(jnp.array(FORCE)).nominal == ()
@@ -350,6 +359,7 @@ def test_evaluation_with_identified_actuators_includes_the_nominal_robot(evaluat
     assert result.nominal[0].position[1.0][0] < 1e-3 < 5e-3 < result.vanilla[0].position[1.0][0]
 
 
+@pytest.mark.slow
 def test_errors_of_starting_states_are_the_distance_between_them(evaluator: OpenLoopEvaluator):
     """A robot whose starting states are moved by 2 cm walks at a distance of 2 cm."""
     assert all(e.position[2.0][0] == 0.0 for e in evaluator.of_starts(evaluator.motions, jnp.array(FORCE)))
@@ -375,6 +385,7 @@ def test_errors_of_a_group_are_means_over_its_recordings():
     assert means.ratio("near", "orientation", 5.0) == result.ratio("near", "orientation", 5.0) == 1.0
 
 
+@pytest.mark.slow
 def test_recordings_and_actuators_share_one_compiled_program(still: Motion, pushed: Motion):
     other = load_model()
     nominal = ActuatorParameters.nominal(other)
@@ -401,6 +412,7 @@ def test_recordings_and_actuators_share_one_compiled_program(still: Motion, push
     assert replaying[0] == replaying[1]
 
 
+@pytest.mark.slow
 def test_stored_replays_are_those_evaluated(evaluator: OpenLoopEvaluator):
     replays = {"vanilla": evaluator.replay(jnp.array(FORCE), scale=0.0), "envmimic": evaluator.replay(jnp.array(FORCE))}
     takes = artifacts.stored_rollouts(evaluator, replays)

@@ -146,6 +146,7 @@ def balloon(folder: Path) -> AugmentedSimulator:
 
 OFF = '<option><flag contact="disable"/></option>\n  <worldbody>'
 MAKERS = {"rover": rover, "arm": arm, "balloon": balloon}
+EACH = [pytest.param(name, marks=() if name == "arm" else pytest.mark.slow) for name in MAKERS]
 CASES: dict[str, tuple[AugmentedSimulator, Path, tuple[float, float]]] = {}
 
 
@@ -159,7 +160,7 @@ def exported(name: str, folder: Path) -> tuple[AugmentedSimulator, Path, tuple[f
     return CASES[name]
 
 
-@pytest.mark.parametrize("name", MAKERS)
+@pytest.mark.parametrize("name", EACH)
 def test_exported_simulator_agrees_with_the_original(name: str, tmp_path_factory: pytest.TempPathFactory):
     simulator, folder, (distance, angle) = exported(name, tmp_path_factory.mktemp(name))
     assert distance < 1e-6 and angle < 1e-3
@@ -177,7 +178,7 @@ def test_exported_simulator_agrees_with_the_original(name: str, tmp_path_factory
         assert np.abs(there.data.qpos - plain.qpos).max() > 1e-3
 
 
-@pytest.mark.parametrize("name", MAKERS)
+@pytest.mark.parametrize("name", EACH)
 def test_exported_folder_runs_with_numpy_and_mujoco_alone(name: str, tmp_path_factory: pytest.TempPathFactory):
     _, folder, _ = exported(name, tmp_path_factory.mktemp(name))
     done = subprocess.run([sys.executable, "-I", "-c", CLEAN, str(folder)], capture_output=True, text=True)
@@ -188,6 +189,7 @@ def test_exported_folder_runs_with_numpy_and_mujoco_alone(name: str, tmp_path_fa
     assert "ImprovedSimulator" in text and "double precision" in text
 
 
+@pytest.mark.slow
 def test_exported_simulator_agrees_over_five_seconds_with_contacts(tmp_path: Path):
     """The test uses a bundled recording with its actuators and air, so it includes contacts and cables."""
     robot = load_robot()
@@ -205,6 +207,7 @@ def test_exported_simulator_agrees_over_five_seconds_with_contacts(tmp_path: Pat
     assert np.rad2deg(np.abs(ours[:, 3:] - theirs[:, 3:]).max()) < 1e-3
 
 
+@pytest.mark.slow
 def test_exported_robot_can_be_simulated_in_another_scene(tmp_path_factory: pytest.TempPathFactory):
     _, folder, _ = exported("rover", tmp_path_factory.mktemp("rover"))
     alone = ImprovedSimulator(folder)
@@ -225,6 +228,7 @@ def test_exported_robot_can_be_simulated_in_another_scene(tmp_path_factory: pyte
         ImprovedSimulator(folder, other)
 
 
+@pytest.mark.slow
 def test_onnx_networks_agree_and_name_their_inputs(tmp_path_factory: pytest.TempPathFactory):
     import onnx
     import onnxruntime

@@ -93,6 +93,7 @@ def fit(glider: RobotDescription) -> FluidFit:
     return fit_fluid_forces(Simulator(glider), flights(glider, 0, 16), flights(glider, 1, 2), config)
 
 
+@pytest.mark.slow
 @pytest.mark.optimized
 def test_fit_recovers_known_drag_and_lift_from_another_simulator(fit: FluidFit):
     found = fit.estimate
@@ -107,6 +108,7 @@ def test_fit_recovers_known_drag_and_lift_from_another_simulator(fit: FluidFit):
         assert abs(found.values.coefficients[names.index(term), AXES.index(axis)] - wanted) < 0.25 * LIFT, term
 
 
+@pytest.mark.slow
 def test_fit_recovers_the_added_mass(fit: FluidFit):
     """The thrusters turn the glider about the vertical alone. Damping hides the other moments of inertia."""
     found, errors = fit.estimate.values, fit.estimate.standard_errors
@@ -115,6 +117,7 @@ def test_fit_recovers_the_added_mass(fit: FluidFit):
     assert errors.added_mass < 0.2 * ADDED[0]
 
 
+@pytest.mark.slow
 def test_added_mass_has_no_weight(glider: RobotDescription):
     """A body of twice the mass under the same thrust has half the acceleration, and does not sink."""
     simulator = Simulator(glider)
@@ -172,6 +175,7 @@ def test_any_dissipative_linear_wrench_has_passive_coefficients():
     assert np.abs(found.fun).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_a_glider_far_outside_the_recordings_slows_down(glider: RobotDescription, fit: FluidFit):
     """It tumbles and is ten times as fast as any recorded flight."""
     simulator = Simulator(glider)
@@ -183,6 +187,7 @@ def test_a_glider_far_outside_the_recordings_slows_down(glider: RobotDescription
     assert speed.max() < 1.2 * np.linalg.norm(qvel[:3]) and speed[-1] < 0.2 * speed[0]
 
 
+@pytest.mark.slow
 def test_exported_simulator_has_the_added_mass(glider: RobotDescription, fit: FluidFit, tmp_path: Path):
     simulator = Simulator(glider)
     improved = simulator.with_residual(
@@ -194,6 +199,7 @@ def test_exported_simulator_has_the_added_mass(glider: RobotDescription, fit: Fl
     assert found.deviation is not None and found.deviation[0] < 1e-6
 
 
+@pytest.mark.slow
 def test_held_out_flights_are_predicted(fit: FluidFit):
     assert fit.symmetric
     assert fit.scores["quadratic"] < 0.15 * fit.scores["none"]
@@ -227,6 +233,7 @@ def test_wrench_turns_with_the_heading_of_the_body(glider: RobotDescription):
     np.testing.assert_allclose(other.reshape(2, 3), one.reshape(2, 3) @ frame.T, rtol=2e-3, atol=2e-4)
 
 
+@pytest.mark.slow
 def test_files_are_read_back_and_damaged_files_are_refused(fit: FluidFit, tmp_path: Path):
     path = tmp_path / "fluid.json"
     path.write_text(fit.estimate.to_json())

@@ -82,6 +82,7 @@ SETS: list[tuple[ForceSet, np.ndarray, dict[str, Any]]] = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("forces", "loads", "truth"), SETS)
 def test_a_simulator_with_the_missing_load_follows_the_recording(
     robot: RobotDescription, simulator: Simulator, forces: ForceSet, loads: np.ndarray, truth: dict[str, Any]
@@ -105,6 +106,7 @@ def test_a_simulator_with_the_missing_load_follows_the_recording(
             assert found is None if kind != forces else np.allclose(np.asarray(found), 2 * loads)
 
 
+@pytest.mark.slow
 def test_changed_commands_stay_within_their_range(robot: RobotDescription, simulator: Simulator):
     motion = move(robot)
     bound = constant(robot, "commands", np.array([10.0, -10.0]))
@@ -115,6 +117,7 @@ def test_changed_commands_stay_within_their_range(robot: RobotDescription, simul
     np.testing.assert_array_equal(one.state.commands[-1], jnp.zeros(2))  # the history has the command before its change
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("forces", "loads", "truth"), SETS)
 def test_labels_and_scales_recover_the_missing_load(
     robot: RobotDescription, simulator: Simulator, forces: ForceSet, loads: np.ndarray, truth: dict[str, Any]
@@ -134,6 +137,7 @@ def test_labels_and_scales_recover_the_missing_load(
     np.testing.assert_allclose(np.median(actions, axis=0), np.sign(loads), rtol=0.2)
 
 
+@pytest.mark.slow
 def test_the_missing_torque_makes_the_environment_follow_the_recording(robot: RobotDescription, simulator: Simulator):
     motion = move(robot, torque=TORQUE)
     env = EnvMimicEnv(simulator, [motion], EnvMimicConfig(forces="joints", start_noise=0.0))

@@ -53,6 +53,7 @@ def linearize() -> Linearizer:
     return Linearizer(SIMULATOR)
 
 
+@pytest.mark.slow
 def test_labels_recover_a_known_force(motions: list[Motion], linearize: Linearizer):
     """Labels of an anchored robot are in the world frame, independent of the balloon's heading."""
     labels = force_regression.ForceLabeller(linearize, PRIORS, CONFIG)(motions[0])
@@ -63,6 +64,7 @@ def test_labels_recover_a_known_force(motions: list[Motion], linearize: Lineariz
     assert np.ptp(np.asarray(yaw)) > 0.1  # so actions in a heading frame would differ
 
 
+@pytest.mark.slow
 def test_gradients_through_the_simulation_recover_a_known_force(motions: list[Motion], linearize: Linearizer):
     reference, _ = stack_motions(SIMULATOR, motions)
     inputs = np.asarray(recorded_inputs(reference, CONFIG, ROBOT))
@@ -100,6 +102,7 @@ def position_errors(learned: TrainedResidual, motions: list[Motion]) -> tuple[fl
     return float(vanilla), float(residual)
 
 
+@pytest.mark.slow
 def test_regression_returns_a_residual_that_follows_the_recordings(motions: list[Motion]):
     config = dataclasses.replace(PRIORS, updates=600, force_scales=(1.0,))
     learned = fit_supervised(SIMULATOR, motions, config)
@@ -108,6 +111,7 @@ def test_regression_returns_a_residual_that_follows_the_recordings(motions: list
     assert "Labels, training" in learned.report
 
 
+@pytest.mark.slow
 def test_gradients_return_a_residual_that_follows_the_recordings(motions: list[Motion]):
     config = AnalyticConfig(
         window_seconds=0.5, interval_seconds=0.5, relinearizations=2, updates=150, validate_every=150
@@ -116,6 +120,7 @@ def test_gradients_return_a_residual_that_follows_the_recordings(motions: list[M
     assert residual < 0.5 * vanilla
 
 
+@pytest.mark.slow
 def test_aerodynamic_fit_recovers_a_known_added_mass():
     flights = [flight(push=np.zeros(3), added_mass=0.03, seed=seed) for seed in range(2)]
     config = AirConfig(window_seconds=1.0, interval_seconds=1.0)
@@ -141,6 +146,7 @@ def altered(folder: Path, *texts: str) -> RobotDescription:
     return read_description(folder / ROBOT.file.name)
 
 
+@pytest.mark.slow
 def test_learning_does_not_depend_on_the_unit_of_commands(tmp_path: Path):
     """With commands of -2 to 2 instead of 0 to 1, motion, inputs and learned forces stay the same."""
     twin = altered(

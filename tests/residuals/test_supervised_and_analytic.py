@@ -108,6 +108,7 @@ def unforced(recorded: MotionWindows, start: ppo.Params) -> ControlSteps:
     return force_gradients.compile_rollout(SIMULATOR.with_residual(None), FORCES)(still, recorded)[0]
 
 
+@pytest.mark.slow
 def test_derivatives_of_control_steps_agree_with_c_mujoco(unforced: ControlSteps, linearize: Linearizer):
     """Steps include contacts and taut cables. Where a foot lands within a step, finite differences do not approximate
     the derivative. So most steps must agree, not all."""
@@ -141,6 +142,7 @@ def test_derivatives_of_control_steps_agree_with_c_mujoco(unforced: ControlSteps
     assert np.quantile(wrong, 0.75) < 0.1
 
 
+@pytest.mark.slow
 def test_labels_recover_a_known_force_and_torque(linearize: Linearizer):
     """The motions have no noise, and the model is correct except for the force. In the air, all components are
     recovered. On its legs, the robot does not show vertical forces."""
@@ -162,6 +164,7 @@ def test_labels_recover_a_known_force_and_torque(linearize: Linearizer):
     np.testing.assert_allclose(stepping[:2], PUSH[:2], atol=3 * CLOSE)
 
 
+@pytest.mark.slow
 def test_labels_tolerate_legs_that_differ_from_the_model(linearize: Linearizer):
     """Knee springs are stiffer than the model's by a fifth. Joint torques are separate unknowns, so the labels do not
     absorb them. The test uses the median, because labels may be wrong where a foot lands within a step."""
@@ -192,6 +195,7 @@ def test_training_examples_are_in_the_heading_frame(motions: list[Motion]):
     assert len(seen) == len(actions)
 
 
+@pytest.mark.slow
 def test_gradients_recover_a_known_force(
     recorded: MotionWindows, inputs: np.ndarray, start: ppo.Params, linearize: Linearizer
 ):

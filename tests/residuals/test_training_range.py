@@ -63,6 +63,7 @@ def test_loads_are_whole_in_the_range_and_vanish_far_outside():
     assert 1 > along[3] > along[4] > along[5] and along[5] < 1e-6
 
 
+@pytest.mark.slow
 def test_forces_of_a_training_fade_outside_of_its_recordings(motions: list[Motion]):
     env = EnvMimicEnv(SIMULATOR, motions, CONFIG)
     step = jax.jit(env.step)
@@ -77,6 +78,7 @@ def test_forces_of_a_training_fade_outside_of_its_recordings(motions: list[Motio
     assert effect[0] > 1e-3 and effect[1] == 0.0
 
 
+@pytest.mark.slow
 def test_the_loads_of_a_stored_network_fade(motions: list[Motion], tmp_path: Path):
     config = describe_run("envmimic", {"env": CONFIG, "ppo": NETWORK}, {}, [], None, ROBOT)
     reference, _ = stack_motions(SIMULATOR, motions)

@@ -27,6 +27,7 @@ def environment(kind: str) -> Env:
     return EnvMimicEnv(simulator, [reconstruct(recording, robot, simulator.mj_model)], EnvMimicConfig())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["envmimic", "walk"])
 def test_a_training_step_can_be_lowered_for_cuda(kind, monkeypatch: pytest.MonkeyPatch):
     """No operation of reset, physics or learning exists on the CPU only."""

@@ -98,6 +98,7 @@ def together() -> dict[str, Any]:
     return {"coordinator": f"127.0.0.1:{port}", "num_processes": 2}
 
 
+@pytest.mark.slow
 def test_two_processes_agree_with_one_process_with_two_devices(tmp_path: Path) -> None:
     options = together()
     both = [start(TRAINING, tmp_path / f"process-{i}", 1, **options, process_id=i) for i in range(2)]
@@ -117,6 +118,7 @@ def test_two_processes_agree_with_one_process_with_two_devices(tmp_path: Path) -
         np.testing.assert_allclose(kept.training[name], values, rtol=1e-5, atol=1e-6, err_msg=name)
 
 
+@pytest.mark.slow
 def test_every_process_holds_the_model_on_its_own_devices(tmp_path: Path) -> None:
     options = together()
     finish(*(start(PHYSICS, tmp_path, 1, **options, process_id=i) for i in range(2)))

@@ -275,6 +275,7 @@ class Exploding(Follower):
         return dataclasses.replace(after, **{self.part: broken})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("part", ["obs", "reward", "metrics"])
 def test_values_of_nan_reach_neither_learner_nor_metrics(part):
     environment = Exploding()

@@ -375,6 +375,7 @@ def test_observation_and_force_of_an_anchored_robot_are_in_world_frame(motion: M
     np.testing.assert_allclose(force, [0.05, 0.1, 0.15], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_envmimic_trains_and_evaluates_another_robot_from_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     """Run the command with a description and a recording, and evaluate the run."""
     from ballu_mjx.cli import evaluate

@@ -84,6 +84,7 @@ def walk() -> Walk:
     return Walk(PhysicsState(*(jnp.asarray(x, jnp.float32) for x in (qpos, qvel, warmstart))), jnp.asarray(commands))
 
 
+@pytest.mark.slow
 @pytest.mark.optimized
 def test_a_stepping_robot_with_dry_friction_accelerates_as_in_c_mujoco() -> None:
     model = with_dry_friction(6)
@@ -153,6 +154,7 @@ PENDULUM = """
 """A double pendulum whose first joint rests in its limit."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("solver", "iterations"), [("Newton", 3), ("CG", 3), ("CG", 100)])
 def test_derivatives_in_a_joint_limit_agree_with_finite_differences(solver: str, iterations: int) -> None:
     model = mujoco.MjModel.from_xml_string(PENDULUM.format(solver=solver, iterations=iterations))

@@ -86,6 +86,7 @@ def test_constants_of_unaltered_masses_are_unchanged() -> None:
         np.testing.assert_allclose(getattr(found, name), getattr(model, name), rtol=1e-6, err_msg=name)
 
 
+@pytest.mark.slow
 def test_derivatives_of_constants_agree_with_mj_setconst() -> None:
     robot = load_robot()
     model = robot.load_model()
@@ -103,6 +104,7 @@ def test_derivatives_of_constants_agree_with_mj_setconst() -> None:
     np.testing.assert_allclose(derivative, expected, rtol=0.01, atol=1e-3 * np.abs(expected).max())
 
 
+@pytest.mark.slow
 def test_a_robot_with_altered_masses_walks_as_in_c_mujoco() -> None:
     """The walk is open-loop over 5 s, in double precision. With the constants of the original masses, the end would be
     off by 7 mm."""

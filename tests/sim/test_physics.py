@@ -391,6 +391,7 @@ def settled_in_c(parameters: ActuatorParameters, command: tuple[float, float]) -
     return data
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("case", range(len(CASES)))
 def test_settled_knees_and_their_derivatives_agree_with_c_mujoco(case: int) -> None:
     values, derivatives = settled_in_mjx()
@@ -414,6 +415,7 @@ def test_settled_knees_and_their_derivatives_agree_with_c_mujoco(case: int) -> N
             )
 
 
+@pytest.mark.slow
 def test_each_parameter_moves_the_knee_of_its_side() -> None:
     _, derivatives = settled_in_mjx()
     at_stop, taut, saturated = derivatives[0], derivatives[1], derivatives[SATURATED]
@@ -434,6 +436,7 @@ def test_each_parameter_moves_the_knee_of_its_side() -> None:
 # ---- the solver's derivative ----
 
 
+@pytest.mark.slow
 def test_the_step_of_the_convergence_check_is_a_newton_step() -> None:
     """The step equals MJX's own search direction at points where the solver stopped too early."""
     s, model = samples(), load_model()

@@ -141,6 +141,7 @@ def test_what_has_no_portable_form_is_computed(folder: Path):
     assert not list(folder.rglob("*.jax"))
 
 
+@pytest.mark.slow
 def test_a_robot_s_step_and_observation_are_stored(folder: Path):
     """All static fields of a model can be hashed. Otherwise nothing would be stored, without a word."""
     jax.clear_caches()  # other tests may have traced the same programs

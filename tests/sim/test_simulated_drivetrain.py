@@ -71,6 +71,7 @@ def test_control_steps_agree_with_c_mujoco_under_filtered_commands(robot: RobotD
     assert np.abs(true_path(robot, identified(robot, **without), commands)[0] - qpos).max() > 0.2
 
 
+@pytest.mark.slow
 def test_derivatives_by_drivetrain_parameters_agree_with_finite_differences(robot: RobotDescription):
     places = np.array([0, 4, 6, 10])  # scale, delay, backlash and lag of the shoulder
     with jax.enable_x64(True):
@@ -91,6 +92,7 @@ def test_derivatives_by_drivetrain_parameters_agree_with_finite_differences(robo
             assert np.abs(jacobian[:, place]).max() > 0.03
 
 
+@pytest.mark.slow
 def test_a_simulator_without_a_drivetrain_has_no_drivetrain_state(robot: RobotDescription):
     commands = jnp.asarray(wandering(0, STEPS), jnp.float32)
     nominal, same = Simulator(robot), Simulator(robot, identified(robot))
@@ -120,6 +122,7 @@ class Scaled(Residual):
         return commands.ravel()
 
 
+@pytest.mark.slow
 def test_a_residual_changes_commands_before_the_drivetrain(simulator: Simulator):
     commands, start = jnp.asarray(wandering(1, 6)), begin(simulator, jnp.zeros(2))
     halving = BoundResidual(Scaled(), jnp.float32(0.5))
@@ -137,6 +140,7 @@ def motion(robot: RobotDescription) -> Motion:
     return Motion(name="near", time=np.arange(81) * 0.05, command=commands, qpos=qpos, qvel=qvel, fit_error_mm={})
 
 
+@pytest.mark.slow
 def test_replay_follows_the_recording_from_any_starting_state(simulator: Simulator, motion: Motion):
     evaluator, params = OpenLoopEvaluator(simulator, [motion], Scaled()), jnp.float32(1.0)
     (ours,), (nominal,) = evaluator.errors(evaluator.replay(params)), evaluator.nominal_errors(params)
@@ -144,6 +148,7 @@ def test_replay_follows_the_recording_from_any_starting_state(simulator: Simulat
     assert nominal.position[1.0][0] > 10e-3
 
 
+@pytest.mark.slow
 def test_windows_and_episodes_start_with_the_recorded_drivetrain_state(simulator: Simulator, motion: Motion):
     def after(state: RolloutState, commands: Array) -> np.ndarray:
         return np.asarray(run(simulator.with_residual(None), state, commands)[0])
@@ -163,6 +168,7 @@ def test_windows_and_episodes_start_with_the_recorded_drivetrain_state(simulator
     assert np.asarray(stack_motions(simulator, [motion])[0].steps) == [80]
 
 
+@pytest.mark.slow
 def test_linearization_uses_the_state_of_the_drivetrain(simulator: Simulator, motion: Motion):
     states, commands = jax.vmap(start_motion_window)(cut_motion_windows(simulator, [motion], 0.1, 0.5))
     linear = Linearizer(simulator)(ControlSteps(states, commands[:, 0], np.zeros((len(commands), 3))))
@@ -171,6 +177,7 @@ def test_linearization_uses_the_state_of_the_drivetrain(simulator: Simulator, mo
     assert np.isfinite(linear.state).all() and np.abs(linear.state).max() > 0.1
 
 
+@pytest.mark.slow
 def test_policies_are_trained_with_the_identified_delay(tmp_path: Path):
     path = write_rover(tmp_path).file
     content = json.loads(path.read_text()) | {"identify": [{"command": "push", "field": "delay"}]}

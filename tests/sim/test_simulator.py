@@ -80,6 +80,7 @@ def stepped(start: RolloutState, scale: Float[Array, ""]) -> Any:
     return SIMULATOR.with_residual(BoundResidual(Springs(), PARAMS), scale).step(start, COMMAND)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1.0, 0.4, 0.0])
 def test_a_step_applies_the_residual_simulates_and_updates_the_history(start: RolloutState, scale: float):
     physics, features, com, wrench = written_out(start, jnp.float32(scale))
@@ -99,6 +100,7 @@ def test_a_step_applies_the_residual_simulates_and_updates_the_history(start: Ro
         assert np.abs(plain(start).state.physics.qvel - physics.qvel).max() > 1e-3
 
 
+@pytest.mark.slow
 def test_wrenches_of_residuals_and_actions_add_up(start: RolloutState):
     """The wrench is the sum of two residuals, which are scaled, and of another wrench on the base."""
 

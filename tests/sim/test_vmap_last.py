@@ -169,6 +169,7 @@ def robots(request: pytest.FixtureRequest) -> tuple[mjx.Model, mjx.Data, Physics
     return put_model(model), make_data(model), state, command, model.body("balloon").id
 
 
+@pytest.mark.slow
 def test_robots_in_a_batch_move_as_single_robots(robots: tuple[mjx.Model, mjx.Data, PhysicsState, Any, int]):
     model, template, state, command, balloon = robots
 

@@ -554,6 +554,7 @@ def command(folder: Path, **environment: str) -> subprocess.CompletedProcess[str
     return subprocess.run(line, capture_output=True, text=True, env=kept | environment, timeout=300)
 
 
+@pytest.mark.slow
 def test_video_shows_the_robots(short: Path):
     import imageio_ffmpeg
 
@@ -571,6 +572,7 @@ def test_video_shows_the_robots(short: Path):
     assert np.mean(np.abs(pictures[0] - pictures[-1]).max(axis=-1) > 40) > 0.002
 
 
+@pytest.mark.slow
 def test_without_opengl_the_page_is_written_with_a_one_line_warning(short: Path):
     (short / report.REPORT_FILE).unlink(missing_ok=True)
     done = command(short, MUJOCO_GL="disable")

@@ -37,6 +37,7 @@ def test_later_rounds_have_paler_colours():
     assert label_of("envmimic-3") == "EnvMimic, round 3"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [*SUMS, "aerodynamic+envmimic+analytic", "nobody"])
 def test_every_figure_draws_every_combination(name: str, tmp_path: Path):
     """A residual learned on top of another one once caused a KeyError after training."""
