@@ -28,8 +28,7 @@ def compile_fast() -> None:
     for users, unless the test sets `fast_compilation.ENVIRONMENT`. Their compiled programs stay in the cache for runs
     after the tests.
     """
-    os.environ["XLA_FLAGS"] = f"{OLDER_FUSION} {os.environ.get('XLA_FLAGS', '')}".strip()
-    runtime.prepare()
+    runtime.prepare(brief=True)
     import jax  # only after `prepare`
 
     jax.jit(lambda: 0)()  # the first compilation reads the flags; later changes have no effect

@@ -5,11 +5,16 @@ JAX and modules that need it are imported inside functions: `runtime.prepare` ha
 
 from __future__ import annotations
 
+import argparse
+import contextlib
 import sys
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ballu_mjx.common import runtime
+from ballu_mjx.common import files, runtime
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.runs.layout import CONFIG_FILE
 
 if TYPE_CHECKING:
     from ballu_mjx.cli._command import TrainCommand
@@ -23,7 +28,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     def run() -> int:
         # Short trainings spend most of their time on compiling.
-        runtime.prepare(brief="--quick" in (sys.argv[1:] if arguments is None else arguments))
+        runtime.prepare(brief=_is_brief(sys.argv[1:] if arguments is None else arguments))
         from ballu_mjx.cli._command import run_command
 
         description = (
@@ -44,6 +49,24 @@ def subcommands() -> Mapping[str, Any]:
     from ballu_mjx.cli._command import parsers
 
     return parsers(_commands())
+
+
+def _is_brief(arguments: Sequence[str]) -> bool:
+    """Return whether this command, or the one that began the run it resumes, has --quick.
+
+    A resumed training then compiles as before, and gives the same numbers as an uninterrupted one. The options are read
+    here because JAX has to be configured before they are parsed. Faults are reported by the parsing.
+    """
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--resume", type=Path, nargs="?")
+    options, _ = parser.parse_known_args(arguments)
+    if options.quick or options.resume is None:
+        return options.quick
+    with contextlib.suppress(InputError, OSError, LookupError, TypeError):
+        config = files.read_json(options.resume / CONFIG_FILE, "restore it")
+        return "--quick" in config["starts"][0]["command"]
+    return False
 
 
 def _commands() -> Mapping[str, TrainCommand]:

@@ -150,6 +150,7 @@ def missing_loads(
     every = max(sum(len(motion.command) for motion in motions) // _STATES, 1)
     window = max(round(_AVERAGING_TIME / robot.control_timestep), 1)
     reference, _ = stack_motions(plain, motions)
+    yaws = np.asarray(reference.features)[:, :, ObservationLayout.yaw]  # JAX would compile a program for each slice
     found = []
     for number, motion in enumerate(motions):
         applied, sent = _base_residual(augmented, model, reference, number, motion)
@@ -176,8 +177,7 @@ def missing_loads(
             effects.append((moved - after[here]) / change[here, None])
         loads = _solve_loads(root, np.stack(effects, axis=2), missing)
         if FORCE_SETS[forces].turns and heading_frame and not robot.anchored:
-            yaw = np.asarray(reference.features)[number, here, ObservationLayout.yaw]
-            to_heading = Rotation.from_euler("z", -yaw[:, None]).as_matrix()
+            to_heading = Rotation.from_euler("z", -yaws[number, here, None]).as_matrix()
             loads = (loads.reshape(len(here), -1, 3) @ to_heading.swapaxes(1, 2)).reshape(len(here), -1)
         found.append(loads)
     return _summarize(np.concatenate(found))

@@ -170,6 +170,33 @@ def test_quick_changes_defaults_but_not_given_options():
     assert ppo == dataclasses.replace(PPOConfig(), seed=3)  # two given options equal the defaults without --quick
 
 
+@pytest.mark.parametrize(
+    ("arguments", "brief"),
+    [
+        (["walk", "--quick"], True),
+        (["walk", "--resume", "quick"], True),
+        (["all", "--resume=quick"], True),
+        (["walk", "--resume", "full"], False),
+        (["walk", "--resume", "damaged"], False),
+        (["walk", "--resume", "missing"], False),
+        (["walk", "--resume"], False),
+        (["walk", "--output", "quick"], False),
+    ],
+)
+def test_a_resumed_quick_run_compiles_as_when_it_began(
+    arguments: list[str], brief: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    for name, starts in (
+        ("quick", [{"command": ["train", "walk", "--quick"]}, {"command": ["train", "walk", "--resume", "quick"]}]),
+        ("full", [{"command": ["train", "walk"]}]),
+        ("damaged", [None]),
+    ):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "config.json").write_text(json.dumps({"starts": starts}))
+    monkeypatch.chdir(tmp_path)
+    assert train._is_brief(arguments) == brief
+
+
 def test_preset_changes_defaults_but_not_given_options(tmp_path: Path):
     found = []
 
