@@ -26,7 +26,7 @@ def prepare() -> None:
         sys.path.insert(0, ".")
     from ballu_mjx.common import runtime
 
-    runtime.prepare()
+    runtime.prepare(brief="--quick" in sys.argv[1:])  # spends most of its time on compiling
 
 
 def write_table(text: str, folder: Path) -> None:

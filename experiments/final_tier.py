@@ -70,6 +70,8 @@ METHODS = ("paper", "regression", "analytic")
 """Methods of `fidelity.METHODS` besides EnvMimic and the white box."""
 _UNIT_FORMAT = "ballu-final-unit/1"
 _DECIMALS = 5
+METHOD = fidelity.METHODS["identified"].label
+"""Row with which the others are compared in pairs."""
 PREDICTED = "smallest predicted error"
 """Row of the policies that `train all` names first, before any trial."""
 
@@ -253,17 +255,26 @@ def read_unit(path: Path, drawn: Mapping[str, Any]) -> dict[str, Any]:
 def fidelity_tables(results: Sequence[Ratios]) -> dict[str, Table]:
     """Return the tables of errors over each horizon, given those of each robot.
 
-    Cells are means over robots with Student's t interval. Each robot's value is the mean over training seeds. The
-    table `robots` has the values of each robot over the longest horizon.
+    Cells are means over robots with Student's t interval. Each robot's value is the mean over training seeds. Tables
+    `pairs-HORIZON` have the paired differences of EnvMimic and each other simulator. The table `robots` has the values
+    of each robot over the longest horizon.
     """
     tables = {}
     for horizon, first in results[0].items():
         columns = list(first["vanilla"])
-        rows = [
-            (label, *(_fidelity_cell([robot[horizon][label][c] for robot in results], label, c) for c in columns))
+        means = {
+            label: [[float(np.mean(_finite(robot[horizon][label][c]))) for robot in results] for c in columns]
             for label in first
-        ]
+        }
+        rows = [(label, *map(_fidelity_cell, means[label], [label] * len(columns), columns)) for label in first]
         tables[horizon] = Table((f"{horizon} s", *map(_title, columns)), tuple(rows))
+        ours = means[METHOD]
+        pairs = [
+            (label, *map(_difference, ours, means[label], [".2f"] * len(columns)))
+            for label in first
+            if label not in ("vanilla", METHOD)
+        ]
+        tables[f"pairs-{horizon}"] = Table((f"{METHOD} minus this, {horizon} s", *map(_title, columns)), tuple(pairs))
     last = list(results[0])[-1]
     columns = list(results[0][last]["vanilla"])
     made = [
@@ -286,10 +297,10 @@ def _form(label: str, column: str) -> tuple[str, str]:
     return (".3f", "m") if column.endswith("position") else (".1f", "deg")
 
 
-def _fidelity_cell(values: Sequence[Sequence[float | None]], label: str, column: str) -> Cell:
-    """Return the cell of one simulator, given its `values[robot][training]`."""
+def _fidelity_cell(means: Sequence[float], label: str, column: str) -> Cell:
+    """Return the cell of one simulator, given its mean for each robot."""
     form, unit = _form(label, column)
-    return dataclasses.replace(_over_robots([float(np.mean(_finite(each))) for each in values], form), unit=unit)
+    return dataclasses.replace(_over_robots(means, form), unit=unit)
 
 
 def _finite(values: Sequence[float | None]) -> tuple[float, ...]:
@@ -394,7 +405,9 @@ def _won(
 
 
 def _difference(one: Sequence[float], other: Sequence[float], form: str) -> Cell | str:
-    """Return the cell of the paired differences over robots, with Student's t interval. Empty if all are 0."""
+    """Return the cell of the paired differences over robots, with Student's t interval. It is empty if all are 0."""
+    if not all(map(math.isfinite, (*one, *other))):
+        return "diverged"
     if list(one) == list(other):
         return ""
     bounds = paired_difference(one, other).bounds

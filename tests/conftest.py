@@ -25,7 +25,7 @@ def compile_fast() -> None:
     """Make this process compile with XLA's older fusion, and without most optimizations (see below).
 
     Most tests run their compiled programs only for a moment. Commands that tests start as processes compile as they do
-    for users, unless the test sets `fast_compilation.ENVIRONMENT`. Their compiled programs stay in the cache for runs
+    for users, unless the test sets variables of `fast_compilation`. Their compiled programs stay in the cache for runs
     after the tests.
     """
     runtime.prepare(brief=True)

@@ -1,4 +1,4 @@
-"""Environment variables of processes that compile fast. Their programs run longer and round differently."""
+"""Environment variables of processes that compile fast. Their programs round differently."""
 
 from __future__ import annotations
 
@@ -6,4 +6,7 @@ from ballu_mjx.common import compiler_options
 
 OLDER_FUSION = " ".join(f"--{name}={str(on).lower()}" for name, on in compiler_options.OLDER_FUSION.items())
 """XLA's older fusion. A control step compiles in 4 s with it, and in 15 s otherwise."""
-ENVIRONMENT = {"XLA_FLAGS": OLDER_FUSION, "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
+BRIEF = {"XLA_FLAGS": OLDER_FUSION}
+"""What `runtime.prepare` sets for --quick."""
+FAST = {**BRIEF, "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
+"""For programs that run for a moment: without optimizations they take up to thirty times as long."""

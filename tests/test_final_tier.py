@@ -95,9 +95,24 @@ def test_fidelity_tables_name_diverged_simulations(final_tier: ModuleType) -> No
     vanilla, ours = found["5"].rows
     assert vanilla[1].to_text() == "0.200 m [0.200, 0.200]" and numbers(ours[1]) == pytest.approx([0.3] * 5)
     assert found["5"].columns == ("5 s", "near: position")
+    assert found["pairs-5"].rows == ()
     broken = final_tier.fidelity_tables([robot(0.2, 0.4)] * 4 + [robot(0.2, None)])
     assert broken["5"].rows[1][1].to_text() == "diverged in 1 of 5"
     assert broken["robots"].rows[-1][2].to_text() == "diverged in 1 of 2"
+
+
+def test_fidelity_is_compared_in_pairs_over_robots(final_tier: ModuleType) -> None:
+    # Both simulators vary over robots by more than they differ. The white box has one fit for each robot.
+    results = [
+        {"5": {"vanilla": {"far position": [0.2]}, "EnvMimic": {"far position": [x, x + 0.2]}, "air": {"far position": [y]}}}
+        for x, y in ((0.2, 0.1), (0.5, 0.3), (0.8, 0.8), (1.1, 1.0), (1.4, 1.3))
+    ]
+    ((label, cell),) = final_tier.fidelity_tables(results)["pairs-5"].rows
+    assert label == "air" and numbers(cell) == pytest.approx([0.2, 0.3, 0.1, 0.2, 0.2])
+    # Student's t with four degrees of freedom: 2.776 times the standard error sqrt(0.005 / 5).
+    assert cell.bounds == pytest.approx((0.2 - 0.0878, 0.2 + 0.0878), abs=1e-3)
+    broken = [*results[:4], {"5": {**results[4]["5"], "air": {"far position": [None]}}}]
+    assert final_tier.fidelity_tables(broken)["pairs-5"].rows == (("air", "diverged"),)
 
 
 def test_unit_of_another_commit_or_name_is_refused(final_tier: ModuleType, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from experiment_modules import EXPERIMENTS, REAL_DATA, ROOT, needs_real_data
-from fast_compilation import ENVIRONMENT
+from fast_compilation import FAST
 
 pytestmark = [pytest.mark.slow, needs_real_data]
 
@@ -29,7 +29,7 @@ def test_a_quick_run_writes_a_number_for_every_method(name: str, data: str, meth
         [sys.executable, str(script), "--data", str(REAL_DATA / data), "--output", str(tmp_path), "--quick"],
         cwd=ROOT,
         # The blimp's flights are long, so that slow programs cost more time than compiling them well.
-        env={**os.environ, **({} if name == "rgblimp" else ENVIRONMENT)},
+        env={**os.environ, **({} if name == "rgblimp" else FAST)},
         capture_output=True,
         text=True,
         check=False,

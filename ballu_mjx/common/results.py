@@ -10,6 +10,7 @@ import dataclasses
 import datetime
 import json
 import math
+import re
 import statistics
 import sys
 from collections.abc import Mapping, Sequence
@@ -80,7 +81,8 @@ class Results:
 
     **Fields**
 
-    - `command`: the command that measured, as typed in the repository's root.
+    - `command`: the command that measured, as typed in the repository's root. Behind `--results` is the file's present
+      name.
     - `commit`: the commit of the code that measured. None if it did not run from a checkout.
     - `time`: the time of the measurement, in ISO 8601 format.
     - `machine`, `versions`: see `common.provenance`.
@@ -187,7 +189,10 @@ def read_results(path: Path) -> Results:
         raise InputError(f'{path}: is not of the format "{RESULTS_FORMAT}"; {_FIX}.')
     try:
         tables = {name: _table_from_json(table) for name, table in content["tables"].items()}
-        return Results(tables, **{f.name: content[f.name] for f in dataclasses.fields(Results) if f.name != "tables"})
+        others = {f.name: content[f.name] for f in dataclasses.fields(Results) if f.name != "tables"}
+        # The file may have been renamed since, when other options became the default.
+        others["command"] = re.sub(r"(--results results/)\S+", rf"\g<1>{path.name}", others["command"])
+        return Results(tables, **others)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError(f"{path}: lacks a part or has an invalid one ({error}); {_FIX}.") from None
 

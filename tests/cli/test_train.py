@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fast_compilation import BRIEF
 
 from ballu_mjx.ballu.actuators import CABLE_SLACK, ActuatorParameters
 from ballu_mjx.ballu.actuators_file import read_actuators
@@ -38,7 +39,7 @@ from ballu_mjx.runs.metrics import read_metrics
 from ballu_mjx.runs.progress import Progress
 
 SIZES = {name: value for name, value in train_envmimic.QUICK.items() if name != "num_timesteps"}
-"""Sizes of --quick. After these tests, --quick finds its compiled programs in the cache."""
+"""Sizes of --quick."""
 OPTIONS = [text for name, value in SIZES.items() for text in (f"--{name.replace('_', '-')}", str(value))]
 _PPO = PPOConfig(**SIZES)
 STEPS = _PPO.batch_size * _PPO.unroll_length * _PPO.num_minibatches
@@ -47,7 +48,8 @@ STEPS = _PPO.batch_size * _PPO.unroll_length * _PPO.num_minibatches
 
 def command(module: str, *arguments: object, folder: Path) -> subprocess.CompletedProcess[str]:
     line = [sys.executable, "-m", "ballu_mjx", module, *map(str, arguments)]
-    return subprocess.run(line, cwd=folder, capture_output=True, text=True, timeout=600)
+    environment = {**os.environ, **BRIEF}
+    return subprocess.run(line, cwd=folder, env=environment, capture_output=True, text=True, timeout=600)
 
 
 def first_seconds(recording: Recording, duration: float) -> Recording:
@@ -87,7 +89,10 @@ def stopped(folder: Path) -> Stopped:
     )
     line = [sys.executable, "-c", launcher, *line]
     metrics = folder / "run" / "metrics.jsonl"
-    with subprocess.Popen(line, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE) as process:
+    environment = {**os.environ, **BRIEF}
+    with subprocess.Popen(
+        line, cwd=folder, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
+    ) as process:
         while process.poll() is None and not (metrics.exists() and '"reward"' in metrics.read_text()):
             time.sleep(0.1)
         os.kill(process.pid, signal.SIGINT)
