@@ -104,7 +104,13 @@ def test_fidelity_tables_name_diverged_simulations(final_tier: ModuleType) -> No
 def test_fidelity_is_compared_in_pairs_over_robots(final_tier: ModuleType) -> None:
     # Both simulators vary over robots by more than they differ. The white box has one fit for each robot.
     results = [
-        {"5": {"vanilla": {"far position": [0.2]}, "EnvMimic": {"far position": [x, x + 0.2]}, "air": {"far position": [y]}}}
+        {
+            "5": {
+                "vanilla": {"far position": [0.2]},
+                "EnvMimic": {"far position": [x, x + 0.2]},
+                "air": {"far position": [y]},
+            }
+        }
         for x, y in ((0.2, 0.1), (0.5, 0.3), (0.8, 0.8), (1.1, 1.0), (1.4, 1.3))
     ]
     ((label, cell),) = final_tier.fidelity_tables(results)["pairs-5"].rows

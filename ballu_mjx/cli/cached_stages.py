@@ -19,6 +19,7 @@ from ballu_mjx.common.errors import InputError
 from ballu_mjx.runs.checkpoints import list_checkpoints
 
 _KEY = re.compile("[0-9a-f]{16}")
+_MARK = ".stage.json"
 SET_ASIDE = re.compile(r"\.[0-9a-f]{16}$")
 """End of the names of folders that were made with other options and renamed."""
 
@@ -29,6 +30,7 @@ def cached_stage(
     """Return the `folder` of a stage. Call `make` to fill it unless it is already there with the same key.
 
     The key is a hash of `options` and of the keys of the stages `needs`. A folder with another key is renamed and kept.
+    A folder that was deleted is made again.
     If a folder with the same key is unfinished, `make` continues in it if `goes_on` is true and it has checkpoints.
     Otherwise the folder is emptied first.
 
@@ -41,14 +43,13 @@ def cached_stage(
     }
     key = hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:16]
     mark = stage_mark(folder)
-    found = read_mark(mark) if mark.exists() else None
+    found = read_mark(mark) if mark.exists() and folder.is_dir() else None
     if found is not None and found["key"] == key and found["done"]:
         return folder
     if found is not None and found["key"] != key:
         aside = folder.with_name(f"{folder.name}.{found['key']}")
         shutil.rmtree(aside, ignore_errors=True)
-        if folder.exists():
-            folder.rename(aside)
+        folder.rename(aside)
         print(f"{folder}: made with other options or inputs; renamed to {aside.name}.")
         found = None
     print(f"\n== {folder.name}" + (" (resumed)" if goes_on and found is not None else ""), flush=True)
@@ -75,7 +76,7 @@ def check_is_stage(folder: Path) -> None:
 
 def stage_mark(folder: Path) -> Path:
     """Return the path of the file with a stage's key. It is beside the folder, which only `make` fills."""
-    return folder.with_name(folder.name + ".stage.json")
+    return folder.with_name(folder.name + _MARK)
 
 
 def write_mark(path: Path, key: str, content: dict[str, Any], *, done: bool) -> None:
@@ -88,7 +89,7 @@ def read_mark(path: Path) -> dict[str, Any]:
 
     **Raises** `InputError` if the file is damaged.
     """
-    fix = "delete it, and its stage will be made again"
+    fix = f"delete it and the folder {path.name.removesuffix(_MARK)}, and the stage will be made again"
     content = files.read_json(path, fix)
     key = content.get("key")
     if not (isinstance(key, str) and _KEY.fullmatch(key) and isinstance(content.get("done"), bool)):

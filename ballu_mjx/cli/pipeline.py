@@ -69,6 +69,7 @@ from ballu_mjx.residuals.force_gradients import AnalyticConfig
 from ballu_mjx.residuals.force_regression import SupervisedConfig
 from ballu_mjx.residuals.presets import preset_configs
 from ballu_mjx.rl.ppo import PPOConfig
+from ballu_mjx.rl.resume_point import is_finished
 from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs import loggers
 from ballu_mjx.runs.checkpoints import list_checkpoints
@@ -251,6 +252,8 @@ class PipelineStages:
 
         def make(folder: Path) -> None:
             started = list_checkpoints(folder)
+            if started and is_finished(folder, started[-1], ppo):  # resumed by `train TASK --resume`
+                return
             where = train_policy.Data(resume=folder, keep_every=data.keep_every, wandb=data.wandb)
             where = where if started else dataclasses.replace(data, output=folder)
             train_policy.train(TASKS[task], where, config, ppo)
@@ -358,7 +361,9 @@ class PipelineStages:
                 train_forces.train_analytic(train_forces.ForcesData(**sources), options)
             else:
                 data = train_envmimic.Data(**sources, preset="paper" if method == PAPER_PRESET else None)
-                if list_checkpoints(folder):
+                if started := list_checkpoints(folder):
+                    if is_finished(folder, started[-1], options[1]):  # resumed by `train envmimic --resume`
+                        return
                     data = train_envmimic.Data(resume=folder, wandb=data.wandb)
                 train_envmimic.train(data, *options)
 

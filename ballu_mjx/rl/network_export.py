@@ -51,7 +51,7 @@ def network_arrays(params: Params, config: PPOConfig, mirror: Mirror | None = No
     return {
         "mean": mean,
         "std": std,
-        "observation_clip": np.array(clip),
+        "observation_clip": np.array(clip, float),
         "activation": np.array(config.activation),
         **{f"kernel_{i}": kernel for i, (kernel, _) in enumerate(layers)},
         **{f"bias_{i}": bias for i, (_, bias) in enumerate(layers)},

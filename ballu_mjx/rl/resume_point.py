@@ -112,7 +112,7 @@ def find_resume_point(
     before = read_config(folder, task)
     files.check_folder(folder)
     stored = typed_config(PPOConfig, before, "ppo", folder, ppo.check_values)
-    for name in ("policy_layers", "value_layers", "activation", "normalize_observations"):
+    for name in ("policy_layers", "value_layers", "activation", "normalize_observations", "observation_clip"):
         if getattr(stored, name) != getattr(config, name):
             raise InputError(
                 f"--{name.replace('_', '-')} does not go with --resume: the stored parameters have "
@@ -121,12 +121,19 @@ def find_resume_point(
     if not list_checkpoints(folder):
         return ResumePoint(folder)
     checkpoint = last_checkpoint(folder, training=True)
-    # A run that stopped between its last checkpoint and its results still needs the results.
-    if checkpoint.step >= config.num_timesteps and (folder / ROLLOUT_FILE).exists():
+    if is_finished(folder, checkpoint.step, config):
         raise InputError(
             f"{folder}: the run is already at step {checkpoint.step:,}; give a larger --num-timesteps to train longer."
         )
     return ResumePoint(folder, checkpoint)
+
+
+def is_finished(folder: Path, step: int, config: PPOConfig) -> bool:
+    """Return whether a run whose last checkpoint is that of `step` has nothing left to do.
+
+    A run that stopped between its last checkpoint and its results still needs the results.
+    """
+    return step >= config.num_timesteps and (folder / ROLLOUT_FILE).exists()
 
 
 def training_facts(config: Mapping[str, Any]) -> dict[str, Any]:

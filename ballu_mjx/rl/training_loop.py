@@ -7,6 +7,7 @@ import dataclasses
 import functools
 import math
 import signal
+import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -102,6 +103,8 @@ class TrainingLoop:
                 if self._due != int(state.steps):
                     self._keep(int(state.steps), state)
                     self._tell(f"At the end: {self._validated}.")
+                if distributed.anywhere(bool(self.interrupted)):  # during this last validation
+                    raise KeyboardInterrupt
         except KeyboardInterrupt:
             self._close()
             raise TrainingInterrupted(self.exit_status, self._saved) from None
@@ -176,6 +179,7 @@ class TrainingLoop:
 
         A signal handler that raises an exception at once can interrupt a callback of JAX, which swallows it. Handlers
         that other code has installed stay. Ignored signals stay ignored, as for a job in the background of a shell.
+        Python handles signals in its main thread only, so that a training in another thread notes none.
         """
 
         def note(number: int, frame: Any) -> None:
@@ -184,7 +188,8 @@ class TrainingLoop:
             self.interrupted = number
 
         standard = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
-        ours = {number: old for number, old in standard.items() if signal.getsignal(number) == old}
+        main = threading.current_thread() is threading.main_thread()
+        ours = {number: old for number, old in standard.items() if main and signal.getsignal(number) == old}
         for number in ours:
             signal.signal(number, note)
         try:

@@ -68,11 +68,21 @@ def restore_checkpoint(folder: Path, which: Which) -> tuple[int, dict[str, Any]]
 
 def _best_step(folder: Path, steps: Sequence[int]) -> int | None:
     records = {step: _record(folder, step) for step in steps}
-    scored = {step: record for step, record in records.items() if record["score"] is not None}
-    if not scored:
-        return None
-    conditions = scored[max(scored)]["notes"].get(SCORED_WITH)
-    alike = [step for step, record in scored.items() if record["notes"].get(SCORED_WITH) == conditions]
+    scored = {
+        step: checkpoint_metrics(record["score"], record["notes"])
+        for step, record in records.items()
+        if record["score"] is not None
+    }
+    return _best(scored) if scored else None
+
+
+def _best(scored: Mapping[int, Mapping[str, Any]]) -> int:
+    """Return the step with the smallest score among those with the conditions of the last one.
+
+    `scored` holds the `checkpoint_metrics` of each step.
+    """
+    conditions = scored[max(scored)].get(SCORED_WITH)  # files of older versions lack it
+    alike = [step for step, metrics in scored.items() if metrics.get(SCORED_WITH) == conditions]
     return min(alike, key=lambda step: (scored[step]["score"], -step))
 
 
@@ -92,6 +102,11 @@ def last_checkpoint(folder: Path, *, training: bool = False) -> Checkpoint:
             f"{folder}: all checkpoints of the run are damaged; restore one from a copy, or start a new run."
         )
     raise _no_checkpoint(folder, "checkpoint")
+
+
+def has_score(folder: Path, step: int) -> bool:
+    """Return whether the checkpoint of a step has a score. One that an interruption saved has none."""
+    return _record(folder, step)["score"] is not None
 
 
 def list_checkpoints(folder: Path) -> list[int]:
@@ -186,13 +201,32 @@ def _no_checkpoint(folder: Path, kind: str) -> InputError:
     return InputError(f"{folder}: the run has no {kind}; train for longer.")
 
 
+class _Kept(policies.PreservationPolicy):
+    """Keeps the last `CHECKPOINTS_KEPT` checkpoints with a score, the best of them, and the last one of all.
+
+    The last one has no score if an interruption saved it. It is not counted, so that a resumed run keeps the same
+    checkpoints as an uninterrupted one.
+    """
+
+    def should_preserve(self, checkpoints: Sequence[Any], *, context: Any) -> Sequence[bool]:
+        del context
+        scored = {each.step: each.metrics for each in checkpoints if each.metrics is not None}
+        best = {_best(scored)} if scored else set()
+        kept = {*sorted(scored)[-CHECKPOINTS_KEPT:], *best, checkpoints[-1].step}
+        return [each.step in kept for each in checkpoints]
+
+
+def checkpoint_metrics(score: float, notes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what orbax stores with a checkpoint, from which it is decided which checkpoints are kept."""
+    return {"score": score, SCORED_WITH: notes.get(SCORED_WITH)}
+
+
 def checkpoint_manager(folder: Path) -> ocp.CheckpointManager:
-    """Return the orbax manager of a run's checkpoints, which keeps the last `CHECKPOINTS_KEPT` and the best."""
-    best = policies.BestN(get_metric_fn=_score, reverse=True, n=1, keep_checkpoints_without_metrics=False)
+    """Return the orbax manager of a run's checkpoints. `_Kept` says which it keeps."""
     options = ocp.CheckpointManagerOptions(
         best_fn=_score,
         best_mode="min",
-        preservation_policy=policies.AnyPreservationPolicy([policies.LatestN(CHECKPOINTS_KEPT), best]),
+        preservation_policy=_Kept(),
         enable_async_checkpointing=False,
         create=False,
         multiprocessing_options=_alone(),

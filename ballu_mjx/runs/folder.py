@@ -4,8 +4,9 @@ config.json         everything needed to repeat the run
 metrics.jsonl       one JSON object per line: `step` (control steps) and the measurements at that step
 tensorboard/        the same measurements for TensorBoard
 wandb/              the same measurements for Weights & Biases, on request
-checkpoints/STEP/   the last three, and the best by validation (orbax): `params`, everything needed to use the
-                    result; `training`, the further state needed to resume; `record.json`, checksums of all files
+checkpoints/STEP/   the last three that were validated, the best of all, and the last (orbax): `params`, everything
+                    needed to use the result; `training`, the further state needed to resume; `record.json`, checksums
+                    of all files
 evaluation.txt, evaluation.json, learning_curve.png, tracking.png
 replay.npz          motions of the robots, for `ballu_mjx report` and `ballu_mjx view`
 """
@@ -39,8 +40,10 @@ from ballu_mjx.runs import loggers
 from ballu_mjx.runs.checkpoints import (
     CHECKPOINT_OVERHEAD,
     checkpoint_manager,
+    checkpoint_metrics,
     drop_checkpoints,
     file_checksums,
+    has_score,
     record_checksum,
     restore_checkpoint,
     suppress_full_disk_output,
@@ -267,7 +270,7 @@ class Run:
         training: Mapping[str, np.ndarray] | None = None,
         notes: Mapping[str, Any] | None = None,
     ) -> None:
-        """Write a checkpoint, unless the one of `step` exists already.
+        """Write a checkpoint, unless the one of `step` exists already and has a score or `score` is None.
 
         **Arguments**
 
@@ -279,11 +282,13 @@ class Run:
         if self._manager is None:
             self._manager = checkpoint_manager(self.folder)
         if step in self._manager.all_steps():
-            return
+            if score is None or has_score(self.folder, step):
+                return
+            self._manager.delete(step)
         trees = {PARAMS_FOLDER: dict(params)} | ({} if training is None else {TRAINING_FOLDER: dict(training)})
         items = {name: ocp.args.StandardSave(tree) for name, tree in trees.items()}
         finite = None if score is None else score if math.isfinite(score) else NO_SCORE
-        metrics = None if finite is None else {"score": finite}
+        metrics = None if finite is None else checkpoint_metrics(finite, notes or {})
         files.reserve(
             self.folder, CHECKPOINT_OVERHEAD + 2 * sum(np.asarray(leaf).nbytes for leaf in jax.tree.leaves(trees))
         )

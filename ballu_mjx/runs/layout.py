@@ -8,7 +8,7 @@ from typing import Any
 RUN_FORMAT = "ballu-run/2"
 """Format of a run's folder. Checkpoints of version 1 held only parameters."""
 CHECKPOINTS_KEPT = 3
-"""Number of latest checkpoints that are kept."""
+"""Number of latest checkpoints with a score that are kept."""
 
 READABLE_FORMATS = ("ballu-run/1", RUN_FORMAT)
 CONFIG_FILE, METRICS_FILE, LOCK_FILE, CHECKPOINTS_FOLDER = "config.json", "metrics.jsonl", ".lock", "checkpoints"

@@ -1,17 +1,23 @@
 """Stages of the pipeline: they are cached, and made again if an option or an earlier stage has changed."""
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from ballu_mjx.ballu.virtual.hardware import VirtualHardware
-from ballu_mjx.cli import pipeline
+from ballu_mjx.cli import pipeline, train_policy
 from ballu_mjx.cli.cached_stages import cached_stage
 from ballu_mjx.cli.pipeline import Options
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.residuals.presets import preset_configs
+from ballu_mjx.runs.checkpoints import restore_checkpoint
+from ballu_mjx.runs.folder import Run
+from ballu_mjx.runs.layout import RUN_FORMAT
+from ballu_mjx.runs.rollout_file import ROLLOUT_FILE
 
 
 class Interrupted(Exception):
@@ -74,6 +80,48 @@ def test_unfinished_stages_are_made_again(tmp_path):
     content = json.loads(mark.read_text())
     mark.write_text(json.dumps(content | {"done": False}))
     assert run_stages(tmp_path, {"a": 1, "b": 2, "c": 3}) == ["b"]
+
+
+def test_a_deleted_folder_is_made_again(tmp_path):
+    """Messages about damaged results advise to delete a stage's folder."""
+    run_stages(tmp_path, {"a": 1, "b": 2, "c": 3})
+    shutil.rmtree(tmp_path / "b")
+    assert run_stages(tmp_path, {"a": 1, "b": 2, "c": 3}) == ["b"]
+
+
+def test_the_advice_on_a_damaged_mark_works(tmp_path):
+    run_stages(tmp_path, {"a": 1, "b": 2, "c": 3})
+    mark = tmp_path / "b.stage.json"
+    mark.write_text("{}")
+    with pytest.raises(InputError, match=r"b\.stage\.json: .*; delete it and the folder b, and the stage will be made"):
+        run_stages(tmp_path, {"a": 1, "b": 2, "c": 3})
+    mark.unlink()
+    shutil.rmtree(tmp_path / "b")
+    assert run_stages(tmp_path, {"a": 1, "b": 2, "c": 3}) == ["b"]
+
+
+def test_a_policy_that_the_user_has_resumed_to_its_end_is_kept(tmp_path, monkeypatch):
+    """An interrupted training prints how to resume it without the pipeline."""
+    options = Options(output=tmp_path, policy_steps=1000)
+    stages = pipeline.PipelineStages(options, 0, VirtualHardware.draw(0))
+
+    def interrupted(task: Any, data: train_policy.Data, config: Any, ppo: Any) -> None:
+        assert data.output is not None
+        content = {"format": RUN_FORMAT, "task": "walk", "starts": []}
+        with Run(data.output, content) as run:
+            run.save(500, {"weight": np.zeros(1)}, None)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(train_policy, "train", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        stages.policy("walk", "vanilla+dr")
+    folder = tmp_path / "seed-0" / "walk-vanilla+dr"
+    with Run(folder, {"format": RUN_FORMAT, "task": "walk", "starts": []}, resumed_at=500) as run:
+        run.save(1000, {"weight": np.ones(1)}, 0.5)
+    (folder / ROLLOUT_FILE).touch()
+    monkeypatch.setattr(train_policy, "train", lambda *_: pytest.fail("trained again"))
+    assert stages.policy("walk", "vanilla+dr") == folder
+    assert restore_checkpoint(folder, "best")[0] == 1000
 
 
 def test_trial_draws_are_unique_and_reproducible():

@@ -310,12 +310,12 @@ def test_evaluate_refuses_a_changed_recording(trained, monkeypatch, capsys):
     assert "has changed since run/config.json was written" in capsys.readouterr().err
 
 
-def test_last_three_checkpoints_and_the_best_are_kept(tmp_path: Path):
+def test_last_three_scored_checkpoints_the_best_and_the_last_are_kept(tmp_path: Path):
     with Run(tmp_path / "run", {"format": RUN_FORMAT, "task": "envmimic", "starts": []}) as run:
         for step, score in enumerate([0.9, 0.5, 0.7, 0.8, float("nan"), 0.6]):
             run.save(step, {"x": np.full(3, step)}, score)
         run.save(6, {"x": np.full(3, 6)}, None)
-    assert sorted(int(path.name) for path in (tmp_path / "run" / "checkpoints").iterdir()) == [1, 4, 5, 6]
+    assert sorted(int(path.name) for path in (tmp_path / "run" / "checkpoints").iterdir()) == [1, 3, 4, 5, 6]
     for (step, tree), expected in (
         (restore_checkpoint(tmp_path / "run", "best"), 1),
         (restore_checkpoint(tmp_path / "run", "last"), 6),

@@ -8,6 +8,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -24,9 +25,9 @@ from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.rl import ppo, training_state
 from ballu_mjx.rl.learner import Learner
-from ballu_mjx.rl.ppo import PPOConfig
+from ballu_mjx.rl.ppo import Params, PPOConfig
 from ballu_mjx.rl.resume_point import ResumePoint, find_resume_point, training_facts
-from ballu_mjx.rl.training_loop import TrainingLoop, Validation
+from ballu_mjx.rl.training_loop import TrainingInterrupted, TrainingLoop, Validation
 from ballu_mjx.rl.training_state import TrainingState
 from ballu_mjx.rl.watchdog import Watchdog
 from ballu_mjx.runs.checkpoints import last_checkpoint, list_checkpoints, restore_checkpoint
@@ -103,6 +104,33 @@ def test_a_signal_ends_training_after_the_step_and_sets_the_exit_status(tmp_path
         assert signal.getsignal(number) in (signal.default_int_handler, signal.SIG_DFL), "handler not restored"
     finally:
         signal.signal(number, before)
+
+
+def test_a_signal_during_the_last_validation_is_obeyed(tmp_path, monkeypatch):
+    monkeypatch.setattr(signal, "default_int_handler", signal.getsignal(signal.SIGINT))
+    measured = []
+
+    def measure(params: Params) -> float:
+        measured.append(weight(params))
+        if len(measured) == 2:
+            os.kill(os.getpid(), signal.SIGINT)
+        return measured[-1]
+
+    with Run(tmp_path / "run", content()) as run:
+        loop = TrainingLoop(run, None, 10_000, Validation(measure))
+        with pytest.raises(TrainingInterrupted) as stopped:
+            loop.train(Follower(), CONFIG, ResumePoint(), content())
+    assert stopped.value.step == last_checkpoint(tmp_path / "run").step >= CONFIG.num_timesteps
+    assert len(measured) == 2
+
+
+def test_a_training_runs_in_any_thread(tmp_path):
+    """Python refuses signal handlers outside of its main thread."""
+    with Run(tmp_path / "run", content()) as run:
+        loop = TrainingLoop(run, None, 10_000, Validation(weight))
+        with ThreadPoolExecutor(1) as pool:
+            pool.submit(loop.train, Follower(), CONFIG, ResumePoint(), content()).result()
+    assert last_checkpoint(tmp_path / "run").step >= CONFIG.num_timesteps
 
 
 def test_training_stops_at_a_loss_of_nan_and_keeps_the_last_good_checkpoint(tmp_path):
@@ -207,12 +235,37 @@ def test_changed_options_reset_the_environments_of_a_resumed_run(tmp_path, small
 
 def test_the_best_checkpoint_of_a_resumed_run_was_scored_with_its_options(tmp_path):
     folder, params = tmp_path / "run", {"weight": np.zeros(1)}
-    for options, scores in (({"force_scale": 0.05}, {0: 0.5, 10: 0.6}), ({"force_scale": 0.5}, {20: 0.9, 30: 0.8})):
+    later = {20: 0.9, 30: 0.8, 40: 0.88, 50: 0.87, 60: 0.89}
+    for options, scores in (({"force_scale": 0.05}, {0: 0.5, 10: 0.6}), ({"force_scale": 0.5}, later)):
         config = content(env=options)
         with Run(folder, config, resumed_at=10 if 20 in scores else None) as run:
             for step, score in scores.items():
                 run.save(step, params, score, notes=training_facts(config))
             assert run.best()[0] == min(scores, key=lambda step: scores[step])
+
+
+@pytest.mark.parametrize("interrupted", [15, 25, 35])
+def test_an_interrupted_run_keeps_the_checkpoints_of_an_uninterrupted_one(tmp_path: Path, interrupted: int):
+    """The checkpoint of the interruption has no score. `train all` replays the last checkpoints on the robot."""
+    folder, params, scores = tmp_path / "run", {"weight": np.zeros(1)}, {10: 0.5, 20: 0.6, 30: 0.9, 40: 0.8}
+    for resumed_at in (None, interrupted):
+        with Run(folder, content(), resumed_at=resumed_at) as run:
+            for step, score in scores.items():
+                if (step > interrupted) == (resumed_at is not None):
+                    run.save(step, params, score)
+            if resumed_at is None:
+                run.save(interrupted, params, None)
+                assert last_checkpoint(folder).step == interrupted
+    assert list_checkpoints(folder) == [10, 20, 30, 40]
+
+
+def test_the_score_of_an_interruption_s_checkpoint_can_be_added(tmp_path: Path):
+    with Run(tmp_path / "run", content()) as run:
+        run.save(10, {"weight": np.zeros(1)}, 0.5)
+        run.save(20, {"weight": np.ones(1)}, None)
+        assert run.best()[0] == 10
+        run.save(20, {"weight": np.ones(1)}, 0.4)
+        assert run.best()[0] == 20
 
 
 def test_a_run_of_an_older_version_resumes_from_its_parameters(tmp_path, small):
@@ -239,8 +292,9 @@ def test_a_run_of_an_older_version_resumes_from_its_parameters(tmp_path, small):
             )
     np.testing.assert_array_equal(again.normalizer.mean["state"], params.normalizer.mean["state"])
     with Run(folder, content(), resumed_at=160) as run:
+        assert list_checkpoints(folder) == [160]
         run.save(240, ppo.as_tree(params), None)
-    assert list_checkpoints(folder) == [160, 240] and last_checkpoint(folder).step == 240
+    assert last_checkpoint(folder).step == 240
 
 
 def test_elapsed_seconds_continue_in_a_resumed_run(tmp_path: Path) -> None:
