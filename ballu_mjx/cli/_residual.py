@@ -17,9 +17,9 @@ from ballu_mjx.identification.stable_time_step import check_stability
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.residuals.dataset import USES, RecordingsData, ResidualDataset
 from ballu_mjx.residuals.envmimic import EnvMimicConfig
-from ballu_mjx.residuals.run_config import describe_run
+from ballu_mjx.residuals.run_config import ResidualReference, describe_run
 from ballu_mjx.residuals.scales import describe_scales, resolve_scales
-from ballu_mjx.residuals.trained_residual import TrainedResidual
+from ballu_mjx.residuals.trained_residual import TrainedResidual, describe_residual
 from ballu_mjx.rl.resume_point import ResumePoint
 from ballu_mjx.runs import loggers
 from ballu_mjx.runs.folder import new_folder
@@ -60,7 +60,7 @@ class Prepared:
         devices = [str(device) for device in jax.devices()]
         identified, robot = self.dataset.identified, self.dataset.robot
         content = describe_run(self.task, sections, self.dataset.files, devices, identified, robot)
-        return content | {"residual": None if self.where is None else str(self.where.resolve())}
+        return content | describe_residual(self.base, self.where)
 
     def show_evaluation(self, residual: TrainedResidual, *, quick: bool) -> None:
         """Evaluate the simulator with the residual on the test recordings; write and print the errors."""
@@ -78,7 +78,7 @@ def train_residual(
     learn: Callable[[Prepared, TrainingRecord], TrainedResidual],
     show: Callable[[Path, TrainedResidual], None],
     *,
-    base: Path | None = None,
+    base: ResidualReference | None = None,
     earlier: Path | None = None,
     start: ResumePoint | None = None,
     first: bool = True,
@@ -127,7 +127,7 @@ def show_report(folder: Path, residual: TrainedResidual) -> None:
 def prepare(
     task: str,
     data: RecordingsData,
-    base: Path | None = None,
+    base: ResidualReference | None = None,
     resume: Path | None = None,
     *,
     earlier: Path | None = None,
@@ -137,7 +137,7 @@ def prepare(
 
     **Arguments**
 
-    - `base`: run folder of a residual that acts beside the one to be learned. None if there is none.
+    - `base`: residual that acts beside the one to be learned. None if there is none.
     - `resume`: run folder to resume. None for a new run.
     - `earlier`: run folder of a residual from which values are taken. None if there is none. Like the base residual, it
       needs its own robot and actuators.
@@ -145,9 +145,12 @@ def prepare(
 
     **Raises** `InputError` for recordings, actuators or a base residual that cannot be used. The message names them.
     """
-    robot = load_chosen_robot(data.robot, resume, task, base or earlier)
-    before = {run: TrainedResidual.load(run, robot) for run in (base, earlier) if run is not None}
-    residual = None if base is None else before[base]
+    where = None if base is None else base.folder
+    robot = load_chosen_robot(data.robot, resume, task, where or earlier)
+    residual = None if base is None else TrainedResidual.load_reference(base, robot)
+    before = {} if residual is None or where is None else {where: residual}
+    if earlier is not None:
+        before[earlier] = TrainedResidual.load(earlier, robot)
     dataset = ResidualDataset.read(data, robot, resume)
     for run, learned in before.items():
         if dataset.undecided:
@@ -169,7 +172,7 @@ def prepare(
             motions = dataset.reconstruct(simulator)
     if resume is None:
         check_stability(robot, motions["training"], dataset.identified)
-    return Prepared(task, folder, dataset, motions, simulator, residual, base, Evaluators(simulator))
+    return Prepared(task, folder, dataset, motions, simulator, residual, where, Evaluators(simulator))
 
 
 def _announce(dataset: ResidualDataset, folder: Path, quick: bool) -> None:

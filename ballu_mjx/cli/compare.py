@@ -213,8 +213,10 @@ def _compare(options: Options) -> None:
         title: {row.label: line for row in found if (line := curve(row.folders, name)) is not None}
         for name, title in CURVES.items()
     }
-    plots.compared(options.output / "compare.png", {title: lines for title, lines in curves.items() if lines})
-    print(f"\nWritten to {options.output}.")
+    panels = {title: lines for title, lines in curves.items() if lines}
+    if panels:
+        plots.compared(options.output / "compare.png", panels)
+    print(f"\nWritten to {options.output}." + ("" if panels else " These runs have no learning curves to draw."))
 
 
 def _options(config: Mapping[str, Any]) -> dict[str, str]:

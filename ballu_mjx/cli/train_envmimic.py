@@ -16,7 +16,7 @@ from ballu_mjx.residuals.envmimic_training import VALIDATE_EVERY, check_envmimic
 from ballu_mjx.residuals.network_loads import check_load_options
 from ballu_mjx.residuals.network_mirror import network_mirror
 from ballu_mjx.residuals.presets import PresetName, describe_preset, preset_values
-from ballu_mjx.residuals.run_config import run_residual
+from ballu_mjx.residuals.run_config import ResidualReference, run_residual
 from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.rl import distributed, learner
 from ballu_mjx.rl.ppo import PPOConfig
@@ -94,10 +94,10 @@ def train(data: Data, env: EnvMimicConfig, ppo: PPOConfig) -> int:
     return train_residual("envmimic", data, sections, learn, show, base=base, start=start, first=first)
 
 
-def _base_residual(data: Data) -> Path | None:
-    """Return the run folder of the residual that acts beside the forces to be learned. None if there is none."""
+def _base_residual(data: Data) -> ResidualReference | None:
+    """Return the residual that acts beside the forces to be learned. None if there is none."""
     if data.resume is None:
-        return data.residual
+        return None if data.residual is None else ResidualReference(data.residual)
     if data.residual is not None:
         raise InputError("--residual does not go with --resume, which keeps the simulator; leave out one of them.")
     return run_residual(read_config(data.resume, "envmimic"), data.resume)

@@ -13,6 +13,7 @@ from ballu_mjx.residuals.dataset import RecordingsData
 from ballu_mjx.residuals.force_gradients import AnalyticConfig, check_analytic_config
 from ballu_mjx.residuals.force_regression import SupervisedConfig, check_supervised_config
 from ballu_mjx.residuals.force_training import fit_analytic, fit_supervised, network_sections
+from ballu_mjx.residuals.run_config import ResidualReference
 from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.runs.metrics import read_column
@@ -100,7 +101,8 @@ def _train(
         env = settle(env, prepared)
         return {"env": env, "ppo": network, "fit": fit, "data": data}
 
-    return train_residual(task, data, sections, learn, show, base=data.residual)
+    base = None if data.residual is None else ResidualReference(data.residual)
+    return train_residual(task, data, sections, learn, show, base=base)
 
 
 SUPERVISED = TrainCommand(

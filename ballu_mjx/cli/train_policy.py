@@ -28,8 +28,8 @@ from ballu_mjx.policies.training import (
     train_policy,
     validation_trials,
 )
-from ballu_mjx.residuals.run_config import describe_run, run_actuators, run_residual
-from ballu_mjx.residuals.trained_residual import TrainedResidual
+from ballu_mjx.residuals.run_config import ResidualReference, describe_run, run_actuators, run_residual
+from ballu_mjx.residuals.trained_residual import TrainedResidual, describe_residual
 from ballu_mjx.rl import distributed, learner
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.robots.description import RobotDescription
@@ -79,8 +79,9 @@ def train(task: Task, data: Data, env: LocomotionConfig, ppo: PPOConfig) -> int:
     robot = load_chosen_robot(data.robot, data.resume, task.name, data.residual)
     check_task(task, robot)
     check_policy_options(env, ppo, data.keep_every, robot)
-    identified, where = _parts(task, data, robot)
-    residual = None if where is None else TrainedResidual.load(where, robot)
+    identified, reference = _parts(task, data, robot)
+    residual = None if reference is None else TrainedResidual.load_reference(reference, robot)
+    where = None if reference is None else reference.folder
     check_belongs(residual, identified, where)
     simulator = Simulator(robot, identified).with_residual(None if residual is None else residual.bound)
     first = distributed.is_first()
@@ -96,7 +97,7 @@ def train(task: Task, data: Data, env: LocomotionConfig, ppo: PPOConfig) -> int:
                 print("  --quick: sizes so small that the policy will not walk.")
         devices = [str(device) for device in jax.devices()]
         content = describe_run(task.name, {"env": env, "ppo": ppo, "data": data}, {}, devices, identified, robot)
-        content["residual"] = None if where is None else str(where.resolve())
+        content |= describe_residual(residual, where)
         with open_run(folder, content, start.resumed_at, data.wandb, first=first) as run:
             policy = train_policy(
                 simulator,
@@ -148,6 +149,8 @@ def summary(task: Task, rollout: Rollout, robot: RobotDescription, with_residual
     ]
     runs = f"{len(way)} times {task.trial_seconds:g} s from its initial pose"
     text = f"In its own simulator, {runs}: {', '.join(figures)}."
+    if rollout.divergence is not None:
+        text += f" {rollout.divergence}"
     if with_residual:
         text += (
             f" The residual left the range seen in its training in {rollout.outside.mean():.0%} of the control steps."
@@ -155,8 +158,8 @@ def summary(task: Task, rollout: Rollout, robot: RobotDescription, with_residual
     return text
 
 
-def _parts(task: Task, data: Data, robot: RobotDescription) -> tuple[ModelParameters | None, Path | None]:
-    """Return the actuators (None if nominal) and the run folder of the residual (None if there is none)."""
+def _parts(task: Task, data: Data, robot: RobotDescription) -> tuple[ModelParameters | None, ResidualReference | None]:
+    """Return the actuators (None if nominal) and the residual (None if there is none)."""
     if data.resume is not None:
         chosen = None if data.actuators == AUTO else data.actuators
         for option, given in (("--actuators", chosen), ("--residual", data.residual)):
@@ -166,11 +169,12 @@ def _parts(task: Task, data: Data, robot: RobotDescription) -> tuple[ModelParame
                 )
         stored = read_config(data.resume, task.name)
         return run_actuators(stored, data.resume, robot), run_residual(stored, data.resume)
+    residual = None if data.residual is None else ResidualReference(data.residual)
     if data.actuators == NOMINAL:
-        return None, data.residual
+        return None, residual
     if data.actuators != AUTO:
-        return read_actuators(robot, data.actuators)[1], data.residual
-    return None if data.residual is None else TrainedResidual.load(data.residual, robot).actuators, data.residual
+        return read_actuators(robot, data.actuators)[1], residual
+    return None if residual is None else TrainedResidual.load_reference(residual, robot).actuators, residual
 
 
 def command_for(task: Task) -> TrainCommand:

@@ -31,12 +31,25 @@ class Rollout(NamedTuple):
     outside: Float[np.ndarray, "runs steps"]
     """1 if the residual's observation was outside its training range, else 0."""
     reward: Float[np.ndarray, "runs steps"]
-    """Reward of the task."""
+    """Reward of the task, less the cost of leaving the residual's training range (`LocomotionConfig.outside_cost`)."""
+    diverged: Float[np.ndarray, "runs steps"]
+    """1 if the physics diverged, else 0. The robot then keeps its state, and gets no reward."""
 
     @property
     def yaw(self) -> Float[np.ndarray, "runs states"]:
         """Yaw of the tracked body (rad), not unwrapped."""
         return self.features[..., ObservationLayout.yaw]
+
+    @property
+    def divergence(self) -> str | None:
+        """Sentence about simulations that diverged. None if there are none."""
+        count = int(np.count_nonzero(self.diverged.any(axis=1)))
+        if not count:
+            return None
+        return (
+            f"Physics diverged in {count} of {len(self.diverged)} simulations of the policy, where the robot then "
+            "stands still: its commands or the residual are too extreme for the simulator's time step."
+        )
 
 
 _CHUNK = 100
@@ -65,7 +78,8 @@ class ClosedLoop:
             def advance(state: State, _: None) -> tuple[State, Any]:
                 action = infer(params, state.obs)  # pyright: ignore[reportArgumentType]
                 after = here.step(state, action)
-                return after, (*look(after), env.command_of(action), after.metrics["outside"], after.reward)
+                outside, diverged = (after.metrics[name] for name in ("outside", "diverged"))
+                return after, (*look(after), env.command_of(action), outside, after.reward, diverged)
 
             return jax.lax.scan(advance, state, None, _CHUNK)
 

@@ -113,7 +113,9 @@ def draw_start(setting: SimulatorSetting, robot: RobotDescription, rng: Array) -
     joints = jnp.clip(joints, *setting.joint_range.T)
     if root:
         half = spread.turn * jax.random.uniform(key_turn, (3,), minval=-1.0) / 2
-        quaternion = quaternion_product(jnp.concatenate([jnp.ones(1), half]), initial[3:7])
+        quaternion = initial[3:7]
+        for turn in jnp.concatenate([jnp.cos(half)[:, None], jnp.diag(jnp.sin(half))], axis=1):  # roll, pitch, yaw
+            quaternion = quaternion_product(turn, quaternion)
         joints = jnp.concatenate([initial[:3], quaternion / jnp.linalg.norm(quaternion), joints])
     qvel = spread.velocity * jax.random.normal(key_velocity, spread.velocity.shape)
     return Start(joints, qvel, friction, push, rng)

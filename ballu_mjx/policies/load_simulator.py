@@ -9,7 +9,7 @@ from ballu_mjx.identification.actuators import ACTUATORS_FILE, read_actuators
 from ballu_mjx.policies.policy import check_belongs
 from ballu_mjx.policies.tasks import TASKS
 from ballu_mjx.residuals.registry import RESIDUAL_TASKS
-from ballu_mjx.residuals.run_config import run_actuators, run_residual, run_robot
+from ballu_mjx.residuals.run_config import ResidualReference, run_actuators, run_residual, run_robot
 from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.robots.registry import DEFAULT_ROBOT, load_robot
 from ballu_mjx.runs.folder import read_config
@@ -37,8 +37,8 @@ def load_simulator(run: Path | str | None = None, robot: str | Path | None = Non
     if task == "sysid":
         _, actuators = read_actuators(own, run / ACTUATORS_FILE)
         return Simulator(own, actuators).with_residual(None)
-    where = run if task in RESIDUAL_TASKS else run_residual(stored, run)
-    residual = None if where is None else TrainedResidual.load(where, own)
+    reference = ResidualReference(run) if task in RESIDUAL_TASKS else run_residual(stored, run)
+    residual = None if reference is None else TrainedResidual.load_reference(reference, own)
     actuators = run_actuators(stored, run, own)
-    check_belongs(residual, actuators, where)
+    check_belongs(residual, actuators, None if reference is None else reference.folder)
     return Simulator(own, actuators).with_residual(residual)

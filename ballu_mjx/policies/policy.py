@@ -24,14 +24,15 @@ from ballu_mjx.policies.locomotion_env import (
 )
 from ballu_mjx.policies.simulator_variants import SimulatorVariant
 from ballu_mjx.policies.tasks import TASKS, Task
-from ballu_mjx.residuals.run_config import run_actuators, run_residual, run_robot
+from ballu_mjx.residuals.run_config import ResidualReference, run_actuators, run_residual, run_robot
 from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.ppo import Inference, Params, PPOConfig
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters, bare_parameters, same_parameters
-from ballu_mjx.runs.checkpoints import Which, restore_checkpoint
+from ballu_mjx.runs.checkpoints import restore_checkpoint
 from ballu_mjx.runs.folder import read_config, typed_config
+from ballu_mjx.runs.layout import Which
 from ballu_mjx.sim.drivetrain import drivetrain_of
 
 
@@ -41,8 +42,8 @@ class Policy:
 
     **Fields**
 
-    - `task`, `config`, `robot`, `actuators` (None: nominal), `residual` (or the folder of its run; None: none): parts
-      of its simulator.
+    - `task`, `config`, `robot`, `actuators` (None: nominal), `residual` (or where to find it; None: none): parts of
+      its simulator.
     - `network`: options of its networks.
     - `params`: parameters that `training_state.params` returned.
     - `infer`: function from parameters and observation to the action.
@@ -53,7 +54,7 @@ class Policy:
     config: LocomotionConfig
     robot: RobotDescription
     actuators: ModelParameters | None
-    residual: TrainedResidual | Path | None
+    residual: TrainedResidual | ResidualReference | None
     network: PPOConfig
     params: Params
     infer: Inference
@@ -103,12 +104,12 @@ class Policy:
     def trained_residual(self) -> TrainedResidual | None:
         """Residual in the policy's simulator. None if there is none.
 
-        **Raises** `InputError` if the residual's run is missing, damaged, or of other actuators.
+        **Raises** `InputError` if the residual's run is missing, damaged, changed, or of other actuators.
         """
-        if not isinstance(self.residual, Path):
+        if not isinstance(self.residual, ResidualReference):
             return self.residual
-        found = TrainedResidual.load(self.residual, self.robot)
-        check_belongs(found, self.actuators, self.residual)
+        found = TrainedResidual.load_reference(self.residual, self.robot)
+        check_belongs(found, self.actuators, self.residual.folder)
         return found
 
     @property

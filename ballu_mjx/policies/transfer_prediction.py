@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import logging
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -28,6 +29,8 @@ from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.robots.model import ModelParameters, same_parameters
 from ballu_mjx.sim.simulator import AugmentedSimulator, Simulator
+
+_LOG = logging.getLogger(__name__)
 
 STARTS = 8
 """Number of trials of each policy in each simulator."""
@@ -164,10 +167,16 @@ class TransferPredictor:
         qpos, qvel = self._standing(policy)
         loop = policy.closed_loop() if own is None else self._loop(policy, own)
         motion = loop(policy.params, qpos, qvel, steps)
+        others = {
+            name: motion if name == own else self._loop(policy, name)(policy.params, qpos, qvel, steps)
+            for name in self._simulators
+        }
+        for name, rollout in {"the policy's own simulator": motion, **others}.items():
+            if rollout.divergence is not None:
+                _LOG.warning("In %s: %s", name, rollout.divergence)
         outside = float(motion.outside.mean())
         found = {}
-        for name in self._simulators:
-            other = motion if name == own else self._loop(policy, name)(policy.params, qpos, qvel, steps)
+        for name, other in others.items():
             way = (other.com[:, -1] - other.com[:, 0]).mean(axis=0)
             error = np.linalg.norm(motion.com - other.com, axis=-1).mean()
             found[name] = TransferPrediction(float(error), float(way[0]), float(way[1]), outside)

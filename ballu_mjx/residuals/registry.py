@@ -10,11 +10,12 @@ import dataclasses
 import functools
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters
+from ballu_mjx.runs.layout import Which
 
 if TYPE_CHECKING:
     from ballu_mjx.sim.residual import Residual
@@ -29,7 +30,7 @@ class StoredRun(NamedTuple):
     robot: RobotDescription
     actuators: ModelParameters | None
     """Identified actuators of the run's simulator. None if they are nominal."""
-    which: Literal["best", "last"]
+    which: Which
     """Checkpoint to read, for kinds with checkpoints."""
 
 

@@ -10,7 +10,7 @@ import reprlib
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from ballu_mjx.common import provenance
 from ballu_mjx.common.errors import InputError
@@ -43,12 +43,17 @@ def run_robot(config: Mapping[str, Any], folder: Path) -> RobotDescription:
     return load_robot() if stored is None else find_robot(stored, folder / CONFIG_FILE)
 
 
-def check_compatible_robot(robot: RobotDescription, own: RobotDescription, folder: Path) -> None:
+def check_compatible_robot(
+    robot: RobotDescription, own: RobotDescription, config: Mapping[str, Any], folder: Path
+) -> None:
     """Check that a residual that was learned for the robot `own` of a run can act on `robot`.
+
+    `config` is the content of the run's `config.json`.
 
     **Raises** `InputError` if the robots differ in a quantity of a residual's input or loads. The message names it.
     """
-    for name, words in _SHARED.items():
+    mirrored = config.get("env", {}).get("mirror", False)  # only networks have the section
+    for name, words in (_SHARED | (_MIRRORED if mirrored else {})).items():
         one, other = getattr(robot, name), getattr(own, name)
         if one != other:
             shown = [reprlib.repr(dict(x) if isinstance(x, Mapping) else x) for x in (one, other)]
@@ -69,15 +74,32 @@ _SHARED = {
     "force_joints": "joints that forces act along",
 }
 """Fields of the description that determine inputs and loads of residuals, with their names in messages."""
+_MIRRORED = {"mirror": "mirror images"}
+"""The same for symmetric networks alone."""
 
 
-def run_residual(config: Mapping[str, Any], folder: Path) -> Path | None:
-    """Return the folder of the run whose residual is in a run's simulator. None if the simulator has no residual.
+class ResidualReference(NamedTuple):
+    """Run whose residual is in the simulator of another run."""
+
+    folder: Path
+    step: int | None = None
+    """Step of its checkpoint. None for the best one."""
+    sha256: str | None = None
+    """Checksum of its parameters (`TrainedResidual.sha256`). None to accept any."""
+    user: Path | None = None
+    """The other run, for messages."""
+
+
+def run_residual(config: Mapping[str, Any], folder: Path) -> ResidualReference | None:
+    """Return the residual in a run's simulator. None if the simulator has no residual.
 
     **Raises** `InputError` if `config.json` lacks the key.
     """
     stored = config_section(config, "residual", folder)
-    return None if stored is None else Path(stored)
+    if stored is None:
+        return None
+    step, sha256 = (config.get(f"residual_{name}") for name in ("step", "sha256"))  # older versions lack them
+    return ResidualReference(Path(stored), step, sha256, folder)
 
 
 def describe_run(

@@ -3,19 +3,30 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import hashlib
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
+import jax
+import numpy as np
 from jaxtyping import Array, Float
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.residuals.aerodynamics import AirParameters
 from ballu_mjx.residuals.registry import KINDS, RESIDUAL_TASKS, StoredRun
-from ballu_mjx.residuals.run_config import check_compatible_robot, run_actuators, run_residual, run_robot
+from ballu_mjx.residuals.run_config import (
+    ResidualReference,
+    check_compatible_robot,
+    run_actuators,
+    run_residual,
+    run_robot,
+)
 from ballu_mjx.residuals.training_range import TrainingRange, with_fading
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters
 from ballu_mjx.runs.folder import read_config
+from ballu_mjx.runs.layout import CONFIG_FILE, Which
 from ballu_mjx.sim.residual import BoundResidual, Commands, History, Residual, SumOfResiduals
 from ballu_mjx.sim.simulator import AugmentedSimulator
 
@@ -54,7 +65,7 @@ class TrainedResidual:
     def load(
         folder: Path | str,
         robot: RobotDescription,
-        which: Literal["best", "last"] = "best",
+        which: Which = "best",
         *,
         other_model: bool = False,
         loading: frozenset[Path] = frozenset(),
@@ -65,7 +76,7 @@ class TrainedResidual:
 
         - `folder`: folder of the run.
         - `robot`: robot of the run.
-        - `which`: checkpoint of a network: the best one (by validation error) or the last one.
+        - `which`: checkpoint of a network: the best one (by validation error), the last one, or that of a step.
         - `other_model`: allow a `robot` whose model differs from the run's in its numbers, for example by a payload.
         - `loading`: folders of the runs that have this run as base residual.
 
@@ -76,7 +87,7 @@ class TrainedResidual:
         stored = read_config(folder, *RESIDUAL_TASKS)
         own = run_robot(stored, folder)
         if other_model:
-            check_compatible_robot(robot, own, folder)
+            check_compatible_robot(robot, own, stored, folder)
         elif own.sha256 != robot.sha256:
             raise InputError(f"{folder}: is of the robot {own.name}, not of {robot.name}; give one of the same robot.")
         identified = run_actuators(stored, folder, robot)
@@ -86,14 +97,54 @@ class TrainedResidual:
         observed = TrainingRange.read(folder, inputs)
         model, with_range = with_fading(model, fade_width, observed)
         params = with_range(own_params)
-        where = run_residual(stored, folder) if KINDS[stored["task"]].network else None
-        if where is not None:
-            if where.resolve() in loading:
+        reference = run_residual(stored, folder) if KINDS[stored["task"]].network else None
+        if reference is not None:
+            if reference.folder.resolve() in loading:
                 raise InputError(f"{folder}: is its own base residual; restore its config.json.")
-            base = TrainedResidual.load(where, robot, other_model=other_model, loading=loading)
+            base = TrainedResidual.load_reference(reference, robot, other_model=other_model, loading=loading)
             both = base.bound.plus(BoundResidual(model, params))
             model, params = both.model, both.params
         return TrainedResidual(model, params, observed, step, identified)
+
+    @staticmethod
+    def load_reference(
+        reference: ResidualReference,
+        robot: RobotDescription,
+        *,
+        other_model: bool = False,
+        loading: frozenset[Path] = frozenset(),
+    ) -> TrainedResidual:
+        """Load the residual that another run's simulator contains, as it was when that run was trained.
+
+        The arguments are those of `load`.
+
+        **Raises** `InputError` from `load`, or if the residual has changed since.
+        """
+        from ballu_mjx.runs.checkpoints import list_checkpoints  # orbax takes long to import
+
+        folder, step, sha256, user = reference
+        if user is not None and not folder.is_dir():
+            raise InputError(
+                f"{user / CONFIG_FILE}: names the run {folder}, which is missing; move it back there, or change "
+                '"residual" to its new place.'
+            )
+        steps = list_checkpoints(folder)
+        fix = f"restore {folder}, or repeat the training of {user}"
+        if steps and step is not None and step not in steps:
+            raise InputError(f"{folder}: has no checkpoint of step {step:,} any more, which {user} contains; {fix}.")
+        which = "best" if step is None or not steps else step
+        found = TrainedResidual.load(folder, robot, which, other_model=other_model, loading=loading)
+        if sha256 not in (None, found.sha256):
+            raise InputError(f"{folder}: its residual has changed since {user} was trained with it; {fix}.")
+        return found
+
+    @functools.cached_property
+    def sha256(self) -> str:
+        """SHA-256 of the parameters."""
+        digest = hashlib.sha256()
+        for leaf in map(np.asarray, jax.tree.leaves(self.params)):
+            digest.update(f"{leaf.shape} {leaf.dtype} ".encode() + leaf.tobytes())
+        return digest.hexdigest()
 
     @property
     def bound(self) -> BoundResidual:
@@ -108,6 +159,16 @@ class TrainedResidual:
     def out_of_range(self, history: History, commands: Commands) -> Float[Array, ""]:
         """Return the distance of the residual's input from its training range; see `TrainingRange.excess`."""
         return self.observed.excess(self.model.inputs(history, commands))
+
+
+def describe_residual(residual: TrainedResidual | None, folder: Path | None) -> dict[str, Any]:
+    """Return the entries of a run's `config.json` about the residual in its simulator, which is that of a run.
+
+    Both are None if the simulator has no residual. `run_residual` reads the entries.
+    """
+    if residual is None or folder is None:
+        return {"residual": None}
+    return {"residual": str(folder.resolve()), "residual_step": residual.step, "residual_sha256": residual.sha256}
 
 
 def _latency(model: Residual, params: Any) -> float:

@@ -145,6 +145,8 @@ def training_facts(config: Mapping[str, Any]) -> dict[str, Any]:
     def digest(use: str) -> str:
         recordings = [entry["sha256"] for entry in config.get("recordings", {}).get(use, [])]
         parts = {name: config.get(name) for name in ("env", "actuators", "residual")} | {"recordings": recordings}
+        if config.get("residual") is not None:
+            parts["residual_sha256"] = config.get("residual_sha256")
         return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()
 
     return {

@@ -13,7 +13,7 @@ import sys
 import threading
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, TextIO
+from typing import Any, TextIO
 
 import jax
 import numpy as np
@@ -22,7 +22,14 @@ from orbax.checkpoint import checkpoint_managers as policies
 
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.runs.layout import CHECKPOINTS_FOLDER, CHECKPOINTS_KEPT, PARAMS_FOLDER, RECORD_FILE, TRAINING_FOLDER
+from ballu_mjx.runs.layout import (
+    CHECKPOINTS_FOLDER,
+    CHECKPOINTS_KEPT,
+    PARAMS_FOLDER,
+    RECORD_FILE,
+    TRAINING_FOLDER,
+    Which,
+)
 
 _LOG = logging.getLogger(__name__)
 CHECKPOINT_OVERHEAD = 2**20
@@ -30,8 +37,6 @@ CHECKPOINT_OVERHEAD = 2**20
 
 SCORED_WITH = "scored_with"
 """Note of a checkpoint: hash of the options and recordings on which its score depends. Resumed runs may have others."""
-
-Which = Literal["best", "last"] | int
 
 
 @dataclasses.dataclass(frozen=True)

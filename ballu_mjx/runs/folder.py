@@ -126,7 +126,8 @@ def _is_list_of(value: Any, fits: Callable[[Any], bool]) -> bool:
 _SHAPES: Mapping[str, Callable[[Any], bool]] = {
     **dict.fromkeys(("env", "ppo", "data", "fit"), lambda value: isinstance(value, dict)),
     "actuators": lambda value: value is None or isinstance(value, dict),
-    "residual": lambda value: value is None or isinstance(value, str),
+    **dict.fromkeys(("residual", "residual_sha256"), lambda value: value is None or isinstance(value, str)),
+    "residual_step": lambda value: value is None or type(value) is int,
     "robot_description": lambda value: value is None or _is_description(value),
     "recordings": lambda value: (
         isinstance(value, dict) and all(_is_list_of(entries, _is_description) for entries in value.values())

@@ -33,7 +33,7 @@ ROLLOUT_FILE = "replay.npz"
 _MEND = "write it again with `python -m ballu_mjx evaluate RUN --output RUN`"
 _TOLERANCE = 0.02
 """Tolerance of a quaternion's length, and of commands in units of their range's width."""
-_LARGEST = 1e6
+LARGEST_VALUE = 1e6
 """Largest valid number (m, rad, s) in a rollout."""
 
 
@@ -64,7 +64,8 @@ class StoredRollout:
 def write_rollouts(path: Path, rollouts: Sequence[StoredRollout]) -> None:
     """Write rollouts of one robot to a compressed file, in single precision.
 
-    **Raises** `ValueError` if there are no rollouts, or if their robots have different descriptions.
+    **Raises** `ValueError` if there are no rollouts, if their robots have different descriptions, or if a number is
+    not below `LARGEST_VALUE`.
     """
     from ballu_mjx.robots.registry import describe_robot
 
@@ -84,6 +85,8 @@ def write_rollouts(path: Path, rollouts: Sequence[StoredRollout]) -> None:
         arrays |= {
             f"{index}/{name}": value for name in ("command", "force") if (value := getattr(rollout, name)) is not None
         }
+    if not all((np.abs(a) < LARGEST_VALUE).all() for a in arrays.values() if a.dtype.kind == "f"):
+        raise ValueError("A rollout has a number that is not finite, or too large.")
     single = {name: a.astype(np.float32) if a.dtype.kind == "f" else a for name, a in arrays.items()}
     archive = io.BytesIO()
     np.savez_compressed(archive, **single)  # pyright: ignore[reportArgumentType]
@@ -136,7 +139,12 @@ def _rollout(
         value = own.get(key)
         if value is None and key in ("command", "force"):
             continue
-        if value is None or value.dtype.kind != "f" or value.shape != shape or not (np.abs(value) < _LARGEST).all():
+        if (
+            value is None
+            or value.dtype.kind != "f"
+            or value.shape != shape
+            or not (np.abs(value) < LARGEST_VALUE).all()
+        ):
             raise InputError(f"{path}: {prefix}{key} is not an array of {shape} finite numbers; {_MEND}.")
     if time is None or states < 2 or not qpos:
         raise InputError(f"{path}: rollout {name!r} has no robot, or fewer than two states; {_MEND}.")

@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from jaxtyping import Float
 
 from ballu_mjx.common import files
 from ballu_mjx.evaluation.errors_file import evaluation_to_json
-from ballu_mjx.runs.rollout_file import ROLLOUT_FILE, StoredRollout, write_rollouts
+from ballu_mjx.runs.rollout_file import LARGEST_VALUE, ROLLOUT_FILE, StoredRollout, write_rollouts
 
 if TYPE_CHECKING:
     from ballu_mjx.evaluation.errors import Evaluation
@@ -56,14 +57,18 @@ def draw_tracking(evaluator: OpenLoopEvaluator, replays: Mapping[str, Replay], p
 
 
 def stored_rollouts(evaluator: OpenLoopEvaluator, replays: Mapping[str, Replay]) -> list[StoredRollout]:
-    """Return the replays of whole recordings by simulator, for views in 3D. The force is that of the last simulator."""
+    """Return the replays of whole recordings by simulator, for views in 3D. The force is that of the last simulator.
+
+    A simulation that diverges keeps its last finite state, without force.
+    """
     found = []
     for index, motion in enumerate(evaluator.motions):
         run = evaluator.first_runs[index]
         first = evaluator.starts[run][1]
         states = len(motion.qpos) - first
         *_, last = replays.values()
-        simulated = {simulator: replay.qpos[index, :states] for simulator, replay in replays.items()}
+        force = last.force[run, : states - 1]
+        simulated = {simulator: _while_finite(replay.qpos[index, :states]) for simulator, replay in replays.items()}
         found.append(
             StoredRollout(
                 name=motion.name,
@@ -72,10 +77,16 @@ def stored_rollouts(evaluator: OpenLoopEvaluator, replays: Mapping[str, Replay])
                 time=motion.time[first:],
                 qpos={"recording": motion.qpos[first:], **simulated},
                 command=motion.command[first:],
-                force=last.force[run, : states - 1],
+                force=np.where(np.abs(force) < LARGEST_VALUE, force, 0.0),
             )
         )
     return found
+
+
+def _while_finite(qpos: Float[np.ndarray, "states nq"]) -> Float[np.ndarray, "states nq"]:
+    """Return positions that stay those of the last state before the first one that is not finite."""
+    broken = ~(np.abs(qpos) < LARGEST_VALUE).all(axis=1)
+    return qpos if not broken.any() else qpos[np.minimum(np.arange(len(qpos)), max(int(broken.argmax()) - 1, 0))]
 
 
 def draw_learning_curve(folder: Path, best_step: int) -> None:

@@ -74,6 +74,26 @@ def test_compare_writes_a_table_and_a_plot(folders: list[Path], tmp_path: Path, 
     assert (tmp_path / "out" / "compare.png").stat().st_size > 10_000
 
 
+def test_fits_without_a_reward_are_compared_without_a_plot(folders: list[Path], tmp_path: Path, capsys):
+    fits = []
+    for number, folder in enumerate(folders[:2]):
+        config = {
+            "format": RUN_FORMAT,
+            "task": "aerodynamic",
+            "fit": {"windows": number},
+            "actuators": None,
+            "starts": [],
+        }
+        with Run(tmp_path / f"air-{number}", config) as run:
+            run.log(0, {"cost": 2.0})
+            run.log(1, {"cost": 1.0})
+        fits.append(run.folder)
+        (run.folder / "evaluation.json").write_bytes((folder / "evaluation.json").read_bytes())
+    assert compare.main([*map(str, fits), "--output", str(tmp_path / "out")]) == 0
+    assert "| windows 0 |" in (tmp_path / "out" / "compare.md").read_text()
+    assert "have no learning curves" in capsys.readouterr().out and not (tmp_path / "out" / "compare.png").exists()
+
+
 def test_only_runs_of_equal_length_and_different_seeds_share_a_row(folders: list[Path], tmp_path: Path):
     again = write(tmp_path / "again", 0, 0.05, 1.3)
     assert [row.label for row in compare.rows([folders[0], again])] == ["envmimic", f"envmimic ({again})"]

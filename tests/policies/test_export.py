@@ -3,6 +3,7 @@
 import ast
 import dataclasses
 import importlib.util
+import itertools
 import json
 import math
 import re
@@ -10,6 +11,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -279,11 +281,37 @@ def test_controller_relaxes_after_missing_frames_and_resumes(
     assert command == (1.0, 1.0) and robot.status == "running"
 
 
+def ticks(seconds: float = 0.01) -> Callable[[], float]:
+    """Return a clock that advances by `seconds` from call to call."""
+    return partial(next, (seconds * number for number in itertools.count()))
+
+
+@pytest.mark.parametrize("rate", [20, 100, 1000])
+def test_a_stream_that_stands_still_relaxes_the_commands_at_any_rate_of_calls(exported: Path, rate: int, monkeypatch):
+    robot = Controller(exported, clock=ticks(1 / rate))
+    monkeypatch.setattr(robot, "act", lambda features: np.ones(2))
+    for number in range(rate + 1):
+        robot.step(number / rate, frame_at(number / rate))
+    assert robot.command.tolist() == [1.0, 1.0]
+    relaxed = [robot.step(1.0, frame_at(1.0)) == (0.0, 0.0) for _ in range(rate)]
+    assert TIMEOUT < relaxed.index(True) / rate <= TIMEOUT + FULL_TRAVEL + 0.11
+
+
+def test_repeated_frames_change_neither_the_control_rate_nor_the_rate_limit(exported: Path):
+    """Calls at 1 kHz see each frame of a capture at 100 Hz ten times."""
+    robot = Controller(exported, clock=ticks(0.001))
+    commands = np.array([robot.step(taken, frame_at(taken)) for taken in np.repeat(np.arange(200) * 0.01, 10)])
+    assert robot.steps == pytest.approx(40, abs=1)
+    over = 100  # calls, 0.1 s
+    change = np.abs(commands[over:] - commands[:-over]).max()
+    assert change <= (0.1 + BALLU.control_timestep) / FULL_TRAVEL
+
+
 @pytest.mark.parametrize("times", [lambda n: 1.0, lambda n: math.nan, lambda n: 1.0 - 0.01 * n, lambda n: "soon"])
 def test_controller_relaxes_if_the_clock_does_not_advance(
     exported: Path, monkeypatch: pytest.MonkeyPatch, times: Callable
 ):
-    robot = Controller(exported)
+    robot = Controller(exported, clock=ticks())
     monkeypatch.setattr(robot, "act", lambda features: np.ones(2))
     for number in range(101):
         robot.step(number * 0.01, frame_at(number * 0.01))
@@ -309,7 +337,7 @@ def test_commands_keep_their_limits_for_any_input(exported: Path, seed: int):
     """Frames with random faults come at steady times first, and then at wrong times, too."""
     rng = np.random.default_rng(seed)
     wild: list[Any] = [math.nan, math.inf, -math.inf, 1e308, -1e308, 50.0, None, "x", [], 10**400, 0.0]
-    robot = Controller(exported)
+    robot = Controller(exported, clock=ticks())
     before, changed = (0.0, 0.0), -math.inf
     time: Any = 0.0
     for number in range(4000):

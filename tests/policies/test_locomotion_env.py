@@ -287,3 +287,8 @@ def test_closed_loop_agrees_with_steps_of_the_environment():
     mujoco.mj_kinematics(MODEL, data)
     standing = [data.site(f"foot_{side}").xpos for side in ("left", "right")]
     np.testing.assert_allclose(foot_positions(rollout.features)[-1, -1], standing, atol=1e-4)
+    assert rollout.divergence is None
+    qvel[4] = 1e20
+    broken = loop(GAIN, qpos, qvel, 5)
+    assert broken.diverged.any(axis=1).tolist() == [number == 4 for number in range(9)]
+    assert "diverged in 1 of 9 simulations" in str(broken.divergence) and np.isfinite(broken.com).all()

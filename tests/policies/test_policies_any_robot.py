@@ -86,6 +86,17 @@ def test_a_control_step_and_its_reward_agree_with_c_mujoco(rover: RobotDescripti
     assert float(state.reward) == pytest.approx((data.subtree_com[1] - before)[1] / 0.04, abs=0.02)
 
 
+@pytest.mark.parametrize("largest", [20.0, 90.0, 170.0])
+def test_starting_headings_reach_the_stated_angle(rover: RobotDescription, largest: float):
+    config = dataclasses.replace(RANDOMIZED, start_yaw=largest, start_tilt=0.0)
+    setting = make_simulator_setting(rover, rover.load_model(), config, None)
+    draw = jax.jit(jax.vmap(lambda key: draw_start(setting, rover, key)))
+    qpos = np.asarray(draw(jax.random.split(jax.random.key(0), 2000)).qpos)
+    heading = np.rad2deg(2 * np.arctan2(qpos[:, 6], qpos[:, 3])) - 90.0  # about the keyframe's heading
+    turned = (heading + 180.0) % 360.0 - 180.0
+    np.testing.assert_allclose([turned.min(), turned.max()], [-largest, largest], rtol=0.01)
+
+
 def test_pushes_are_independent_of_the_starting_tilt(rover: RobotDescription):
     config = dataclasses.replace(RANDOMIZED, push_force=1.0, push_torque=0.1)
     setting = make_simulator_setting(rover, rover.load_model(), config, None)

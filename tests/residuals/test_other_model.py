@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from ballu_mjx.residuals.fluid import FLUID_FILE, FluidEstimate, FluidParameters
 from ballu_mjx.residuals.fluid_fit import FluidConfig
 from ballu_mjx.residuals.network_config import ForceNetworkConfig
 from ballu_mjx.residuals.network_input import num_inputs
-from ballu_mjx.residuals.run_config import describe_run
+from ballu_mjx.residuals.run_config import check_compatible_robot, describe_run
 from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.residuals.training_range import TrainingRange
 from ballu_mjx.robots.description import RobotDescription, read_description
@@ -78,6 +79,16 @@ def test_a_robot_with_another_interface_is_refused(
     with pytest.raises(InputError, match=f"cannot stand in for arm.*{message}") as refused:
         TrainedResidual.load(run, other, other_model=True)
     assert str(refused.value).count(". ") == 0
+
+
+def test_a_robot_with_other_mirror_images_is_refused_by_symmetric_networks(robot: RobotDescription, tmp_path: Path):
+    other = dataclasses.replace(robot, mirror={"shoulder": "elbow", "elbow": "shoulder"})
+    own = dataclasses.replace(robot, mirror={})
+    for config in ({}, {"env": {"mirror": False}}):
+        check_compatible_robot(other, own, config, tmp_path)
+    check_compatible_robot(own, own, {"env": {"mirror": True}}, tmp_path)
+    with pytest.raises(InputError, match="cannot stand in for arm.*mirror images differ"):
+        check_compatible_robot(other, own, {"env": {"mirror": True}}, tmp_path)
 
 
 def test_option_robot_requires_recordings(robot: RobotDescription, run: Path, capsys: pytest.CaptureFixture[str]):

@@ -40,7 +40,7 @@ from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs.folder import Run
 from ballu_mjx.runs.rollout_file import ROLLOUT_FILE, StoredRollout, read_rollouts, write_rollouts
-from ballu_mjx.viz import report, report_content, robot_meshes, video, viser_scene
+from ballu_mjx.viz import artifacts, report, report_content, robot_meshes, video, viser_scene
 from ballu_mjx.viz.style import colour_of
 
 LARGEST_PAGE = 10e6
@@ -579,3 +579,17 @@ def test_without_opengl_the_page_is_written_with_a_one_line_warning(short: Path)
     assert done.returncode == 0
     assert "libosmesa6" in done.stderr and done.stderr.count("\n") == 1
     assert (short / report.REPORT_FILE).stat().st_size > 1e6
+
+
+def test_a_simulation_that_diverged_keeps_its_last_state(tmp_path: Path):
+    whole = walk(20, 0.1, 0.0, 0)
+    broken = whole.copy()
+    broken[12, 7], broken[13:] = 3e7, np.nan
+    kept = artifacts._while_finite(broken)
+    np.testing.assert_array_equal(kept[:12], whole[:12])
+    np.testing.assert_array_equal(kept[12:], np.tile(whole[11], (8, 1)))
+    rollout = dataclasses.replace(take("near-1", 20), qpos={"recording": whole, "vanilla": kept})
+    write_rollouts(tmp_path / ROLLOUT_FILE, [rollout])
+    assert set(read_rollouts(tmp_path / ROLLOUT_FILE)[0].qpos) == {"recording", "vanilla"}
+    with pytest.raises(ValueError, match="not finite"):
+        write_rollouts(tmp_path / ROLLOUT_FILE, [dataclasses.replace(rollout, qpos={"vanilla": broken})])

@@ -87,6 +87,8 @@ def run_trials(
     reference, com = stack_motions(simulator, motions)
     starts = [np.stack([getattr(motion, name)[0] for motion in motions]) for name in ("qpos", "qvel")]
     rollout = (loop or policy.closed_loop())(policy.params, starts[0], starts[1], len(motions[0].command))
+    if rollout.divergence is not None:
+        tell(f"{policy.task.name}, {setting}: {rollout.divergence}")
     recorded = np.asarray(com), np.asarray(reference.features)
     on_robot = [_trajectory(*(x[i, : len(motion.qpos)] for x in recorded)) for i, motion in enumerate(motions)]
     simulated = [_trajectory(*states) for states in zip(rollout.com, rollout.features, strict=True)]

@@ -201,7 +201,10 @@ def check_policy(
         if simulator is None:
             simulator = export_simulator(own, Path(temporary) / "simulator", check_seconds=0.0).folder
         there = _read_simulator(Path(simulator), policy)
-    loop = policy.closed_loop()
+    # Trials in C MuJoCo have the reward of the task alone.
+    config = dataclasses.replace(policy.config, outside_cost=0.0)
+    plain = policy if config == policy.config else dataclasses.replace(policy, config=config, loop=None)
+    loop = plain.closed_loop()
     qpos, qvel = loop.standing()
     rollout = loop(policy.params, qpos, qvel, steps)
     moved = rollout.com[0, -1] - rollout.com[0, 0]
@@ -222,7 +225,7 @@ def check_policy(
     network = _run_trial("C MuJoCo", there, act, *rest)
     agreement = _compare(there, own, policy, *map(np.array, zip(*seen, strict=True)))
     from_frames = _run_trial("C MuJoCo, from frames", there, _from_frames(folder), *rest)
-    notes = []
+    notes = [] if rollout.divergence is None else [rollout.divergence]
     if policy.config.sampled_residual:
         notes.append("Training sampled the residual's forces; C MuJoCo uses the mode of their distribution.")
     return PolicyCheck(agreement, trial, network, from_frames, steps * policy.robot.control_timestep, tuple(notes))

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +24,6 @@ ROOM = 100.0
 """Largest absolute coordinate (m) that counts as a measurement."""
 MEMORY = 1.0
 """Time (s) for which frames are kept. It is also the longest gap between two frames that the clock counts."""
-LOST_CALL = 0.01
-"""Time (s) by which the clock advances in a call whose time cannot be used."""
 _JITTER = 0.005
 """Time (s) by which a control step may be early or late without moving the steps after it."""
 
@@ -82,6 +80,7 @@ class Controller:
     - `full_travel`: shortest time (s) in which a command may move through its whole range. 0 for no limit, None for the
       value stored at export.
     - `timeout`: time-out (s) of markers, above 0 and below `MEMORY`; see `TIMEOUT`.
+    - `clock`: function that returns the present time (s). It counts where a call's time does not advance.
 
     **Raises** `ValueError` if a number is out of range, or if the arrays are not a network for this controller.
     """
@@ -91,6 +90,7 @@ class Controller:
         source: Path | str | Mapping[str, np.ndarray],
         full_travel: float | None = None,
         timeout: float = TIMEOUT,
+        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         if not ((full_travel is None or full_travel >= 0) and 0 < timeout < MEMORY):
             raise ValueError(
@@ -122,6 +122,7 @@ class Controller:
         """Number of control steps so far."""
         # The controller's clock starts at 0 and never runs backwards, even if the frames' clock does.
         self._now = self._newest = self._offset = 0.0
+        self._clock, self._called = clock, clock()
         self._due = self._controlled = -math.inf
         self._capture = Capture(self.names)
         self._markers = (self.names[0], orientation_of(self.names[0]), *self.names[1:])
@@ -143,7 +144,7 @@ class Controller:
         **Arguments**
 
         - `time`: time (s) at which the frame was taken, or the present time. It must come from a steady clock
-          (`time.monotonic()`) with any origin. Frames that arrive out of order are ignored.
+          (`time.monotonic()`) with any origin. A frame whose time is not later than that of the last one is ignored.
         - `frame`: mapping, or object with attributes, of arrays in the world frame. `NAME_position` (3 numbers, m) is
           needed for each of `names`, and `NAME_quaternion` (4 numbers: w, x, y, z) for the first of them. NaN means
           hidden. None if no frame arrived.
@@ -180,10 +181,12 @@ class Controller:
             time = float(time)
         except (TypeError, ValueError, OverflowError):
             time = math.nan
+        called, before = self._clock(), self._called
+        self._called = called
         if not self._capture.time and math.isfinite(time):
             self._offset = -time
         elif not time + self._offset > self._newest:  # NaN, too
-            self._now += LOST_CALL
+            self._now += min(max(called - before, 0.0), MEMORY)
             if time + self._offset < self._newest - self.timeout:  # the frames' clock was set back
                 self._newest, self._offset = self._now, self._now - time
             return

@@ -10,6 +10,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
+import logging
 import textwrap
 from collections.abc import Mapping
 from pathlib import Path
@@ -25,6 +26,8 @@ from ballu_mjx.policies.deploy import controller, estimator
 if TYPE_CHECKING:
     from ballu_mjx.policies.policy import Policy
     from ballu_mjx.robots.description import RobotDescription
+
+_LOG = logging.getLogger(__name__)
 
 POLICY_FORMAT = "ballu-policy/1"
 POLICY_FILE = "policy.json"
@@ -179,7 +182,10 @@ def sources() -> dict[str, str]:
 def open_loop(policy: Policy, steps: int) -> Float[np.ndarray, "steps commands"]:
     """Return the policy's commands in its own simulator, from the initial pose."""
     loop = policy.closed_loop()
-    return np.asarray(loop(policy.params, *loop.standing(), steps).command[0], float)
+    rollout = loop(policy.params, *loop.standing(), steps)
+    if rollout.divergence is not None:
+        _LOG.warning("%s", rollout.divergence)
+    return np.asarray(rollout.command[0], float)
 
 
 _FILES = ("controller.py", "estimator.py")
