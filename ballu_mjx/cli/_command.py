@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import math
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -21,6 +22,7 @@ from ballu_mjx.rl.resume_point import ResumePoint, find_resume_point
 from ballu_mjx.rl.training_loop import TrainingInterrupted
 from ballu_mjx.robots.description import RobotDescription, check_simulates
 from ballu_mjx.robots.registry import DEFAULT_ROBOT, load_robot
+from ballu_mjx.runs.checkpoints import restore_checkpoint
 from ballu_mjx.runs.folder import Run, read_config, typed_config
 from ballu_mjx.runs.record import MemoryRecord, TrainingRecord
 
@@ -197,7 +199,11 @@ def open_run(
     If training is interrupted, print the command that resumes it.
     """
     if not first:
-        yield MemoryRecord(content)
+        record = MemoryRecord(content)
+        if resumed_at is not None and resumed_at >= 0:  # if nothing is left to train, no further result is saved
+            step, params = restore_checkpoint(folder, "last")
+            record.save(step, params, math.inf)
+        yield record
         return
     with Run(folder, content, resumed_at=resumed_at, wandb=wandb) as run:
         print("Compiling: about a minute the first time ...", flush=True)

@@ -27,8 +27,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; return the exit status (`runtime.exit_status`)."""
 
     def run() -> int:
+        given = sys.argv[1:] if arguments is None else arguments
         # Short trainings spend most of their time on compiling.
-        runtime.prepare(brief=_is_brief(sys.argv[1:] if arguments is None else arguments))
+        runtime.prepare(brief=_is_brief(given), joins=any(each.startswith("--coordinator") for each in given))
         from ballu_mjx.cli._command import run_command
 
         description = (

@@ -38,10 +38,11 @@ _M_ARENA_MAX = -8
 """Option of glibc's `mallopt` for the largest number of heaps."""
 
 
-def prepare(*, brief: bool = False) -> None:
+def prepare(*, brief: bool = False, joins: bool = False) -> None:
     """Configure JAX for this process, then import MJX. Call this function before anything else imports JAX.
 
-    If `brief` is true, programs compile in less time and run longer (`compiler_options.OLDER_FUSION`).
+    If `brief` is true, programs compile in less time and run longer (`compiler_options.OLDER_FUSION`). If `joins` is
+    true, this process joins others before JAX starts its backend, and `distributed.join` checks JAX.
 
     - The CPU is split into one host device per core. XLA does not spread these small operations over cores, but a
       batch that is sharded over host devices uses all of them. A device count in the user's `XLA_FLAGS` is kept, and
@@ -83,7 +84,8 @@ def prepare(*, brief: bool = False) -> None:
     if not log.handlers:
         log.addHandler(_PlainHandler(logging.WARNING))
         log.propagate = False
-    check_jax()
+    if not joins:
+        check_jax()
     _import_mjx()
 
 

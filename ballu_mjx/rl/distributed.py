@@ -62,6 +62,7 @@ def join(options: DistributedOptions) -> None:
             f"--coordinator {options.coordinator}: the processes could not connect ({error}); check that all {count} "
             "are running, and that the others can reach that port."
         ) from error
+    runtime.check_jax()  # starts the backend
 
 
 def leave(status: int) -> None:

@@ -13,10 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ballu_mjx.cli._command import open_run
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.rl import distributed
 from ballu_mjx.rl.distributed import DistributedOptions
 from ballu_mjx.runs.checkpoints import last_checkpoint
+from ballu_mjx.runs.folder import Run
+from ballu_mjx.runs.layout import RUN_FORMAT
 from ballu_mjx.runs.metrics import read_metrics
 
 TRAINING = """
@@ -148,3 +151,13 @@ def test_a_failing_process_exits_while_others_wait_for_it(tmp_path: Path) -> Non
 def test_inconsistent_options_are_refused(given: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         distributed.join(DistributedOptions(**given))
+
+
+def test_a_process_beside_the_first_has_a_result_if_nothing_is_left_to_train(tmp_path: Path):
+    content = {"format": RUN_FORMAT, "task": "walk", "starts": []}
+    with Run(tmp_path / "run", content) as run:
+        run.save(10, {"weight": np.ones(1)}, 0.5)
+    with open_run(tmp_path / "run", content, 10, None, first=False) as record:
+        assert record.best()[0] == 10
+        record.save(20, {"weight": np.zeros(1)}, 0.9)
+        assert record.best()[0] == 20
