@@ -48,7 +48,8 @@ class Import(runtime.CommandOptions):
     output: Path
     """Recording to write, NAME.csv or NAME.csv.gz. NAME.json is written beside it."""
     commands: Path | None = None
-    """Command log: a CSV, an .npz archive or a bag. Without this option: the motion-capture file holds the commands."""
+    """Command log: a CSV, an .npz archive or a bag. Commands in the motion-capture file are then not read. Without this
+    option: the motion-capture file holds the commands."""
     offset: float | None = None
     """Time (s) to add to the log's times to get the capture's times. The capture begins at 0, or at its first time in a
     table. 0 if both have one clock. Without this option: the offset is estimated from the robot's motion, if the
@@ -146,7 +147,8 @@ def _import(options: Import) -> None:
         raise InputError("--offset and --offset-range need a command log; add --commands.")
     robot = load_robot(options.robot)
     mapping = read_mapping(options.mapping, robot)
-    trajectories = read_capture(options.file, mapping, None if options.format == "auto" else options.format)
+    known = None if options.format == "auto" else options.format
+    trajectories = read_capture(options.file, mapping, known, has_log=options.commands is not None)
     recording = place(trajectories, mapping, robot, recording_name(options.output))
     if recording.time[-1] - recording.time[0] < SHORTEST:
         raise InputError(f"{options.file}: lasts less than {SHORTEST:g} s; capture for longer.")

@@ -18,6 +18,7 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError
+from ballu_mjx.recordings.filters import count_turns, turns_freely
 from ballu_mjx.recordings.recording import Column, ColumnGroup, Kind, Recording, Split, column_groups, values_of
 from ballu_mjx.recordings.recording_hooks import hooks_of
 from ballu_mjx.recordings.validation import (
@@ -42,7 +43,8 @@ def read_recording(path: Path | str, robot: RobotDescription) -> Recording:
     """Read the recording of `robot` at `path`, validate it, and fill its gaps.
 
     `path` is a `.csv` or `.csv.gz` file with its `.json` description beside it. Gaps of up to 0.5 s are interpolated
-    linearly, orientations along the shortest rotation. A pose that repeats to the last digit is a gap too, since
+    linearly, orientations along the shortest rotation. If the angle of a hinge without a range restarts each turn, its
+    turns are counted first, so that a gap adds no full turn. A pose that repeats to the last digit is a gap too, since
     streaming clients repeat the last pose of a body that they do not see.
 
     **Raises** `InputError` for the first fault found, with file, column, row and fix. The header is row 1, as in a
@@ -57,7 +59,7 @@ def read_recording(path: Path | str, robot: RobotDescription) -> Recording:
     held = blank_held(path, columns, groups)
     check_cells(path, columns, groups, robot, kind)
     first, last = check_gaps(path, columns, groups, kind)
-    values, interpolated = _fill(columns, groups, slice(first, last + 1))
+    values, interpolated = _fill(columns, groups, slice(first, last + 1), _turning(groups, robot))
 
     def by_part(quantity: str) -> dict[str, np.ndarray]:
         return {group.part: value for group, value in values.items() if group.quantity == quantity}
@@ -90,7 +92,8 @@ def write_recording(recording: Recording, path: Path | str, robot: RobotDescript
 
     - positions and angles: `decimals`;
     - quaternions: one fewer;
-    - commands: 4 after the first digit of the width of their range, and at least 4;
+    - commands: 4 after the first digit of the width of their range, and at least 4. A command that rounds as a bound of
+      its range does is written as this bound, with all of its digits;
     - time: 3 to 6, as few as represent it exactly.
 
     NaN becomes an empty cell. The same recording always gives the same bytes. Those of compressed files also depend on
@@ -111,14 +114,14 @@ def write_recording(recording: Recording, path: Path | str, robot: RobotDescript
         value = np.asarray(value, float).reshape(length, len(group.names))
         if np.isinf(value).any():
             raise ValueError(f"{', '.join(group.names)}: a value is infinite")
-        if group.quantity == "time":
-            places = [_time_decimals(value)]
-        elif group.quantity == "command":
-            places = [_command_decimals(*limits) for limits in robot.command_ranges]
-        else:
-            places = [decimals - (group.quantity == "quaternion")] * len(group.names)
         header += group.names
-        cells += [[_text(x, p) for x in column] for column, p in zip(value.T.tolist(), places, strict=True)]
+        columns = value.T.tolist()
+        if group.quantity == "command":
+            ranges = zip(columns, robot.command_ranges, strict=True)
+            cells += [[_command_text(x, *limits) for x in column] for column, limits in ranges]
+        else:
+            places = _time_decimals(value) if group.quantity == "time" else decimals - (group.quantity == "quaternion")
+            cells += [[_text(x, places) for x in column] for column in columns]
     lines = [",".join(header), *(",".join(row) for row in zip(*cells, strict=True))]
     content = ("\n".join(lines) + "\n").encode()
     if path.name.endswith(".gz"):
@@ -309,8 +312,14 @@ def _text(value: float, decimals: int) -> str:
     return "0" if text == "-0" else text
 
 
-def _command_decimals(low: float, high: float) -> int:
-    return _COMMAND_DECIMALS + max(0, -math.floor(math.log10(high - low)))
+def _command_text(value: float, low: float, high: float) -> str:
+    """Return a command as text, within its range `low` to `high`."""
+    decimals = _COMMAND_DECIMALS + max(0, -math.floor(math.log10(high - low)))
+    text = _text(value, decimals)
+    for bound in (low, high):
+        if text == _text(bound, decimals):  # The rounded bound may be outside of the range.
+            return np.format_float_positional(bound, trim="-")
+    return text
 
 
 def _time_decimals(time: np.ndarray) -> int:
@@ -321,10 +330,22 @@ def _time_decimals(time: np.ndarray) -> int:
 # ---- gaps ----
 
 
+def _turning(groups: Sequence[ColumnGroup], robot: RobotDescription) -> set[ColumnGroup]:
+    """Return the angles of hinges without a range."""
+    angles = [group for group in groups if group.quantity == "angle"]
+    if not angles:  # Loading the model takes time.
+        return set()
+    model = robot.load_model()
+    return {group for group in angles if turns_freely(model, group.part)}
+
+
 def _fill(
-    columns: dict[str, Column], groups: Sequence[ColumnGroup], rows: slice
+    columns: dict[str, Column], groups: Sequence[ColumnGroup], rows: slice, turning: set[ColumnGroup]
 ) -> tuple[dict[ColumnGroup, Float[np.ndarray, "_ _"]], dict[str, int]]:
-    """Fill gaps. Return the values of each group in `rows`, and the number of interpolated samples by column."""
+    """Fill gaps. Return the values of each group in `rows`, and the number of interpolated samples by column.
+
+    `turning`: angles whose turns are counted.
+    """
     time = columns["time"]
     values: dict[ColumnGroup, np.ndarray] = {}
     interpolated: dict[str, int] = {}
@@ -337,6 +358,8 @@ def _fill(
         else:
             filled = {name: int(np.isnan(columns[name][rows]).sum()) for name in group.names}
             for column in value.T:
+                if group in turning:
+                    column[:] = count_turns(column)
                 gap = np.isnan(column)
                 column[gap] = np.interp(time[gap], time[~gap], column[~gap])
             value = value[rows]

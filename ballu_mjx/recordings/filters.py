@@ -1,12 +1,16 @@
-"""Resampling, means of held commands, and Savitzky-Golay filters of positions and rotations."""
+"""Resampling, angles over full turns, means of held commands, and Savitzky-Golay filters of positions and rotations."""
 
 from __future__ import annotations
 
+import mujoco
 import numpy as np
 from jaxtyping import Float
 from scipy.signal import savgol_filter
 
 from ballu_mjx.recordings.recording import Recording
+
+_TURN_TOLERANCE = 0.1
+"""Tolerance (rad) by which angles that restart each turn may span more than a full turn."""
 
 
 def interpolate(
@@ -15,6 +19,30 @@ def interpolate(
     """Return `values`, sampled at `time` (s), interpolated linearly at the times in `grid` (s)."""
     columns = [np.interp(grid, time, column) for column in values.reshape(len(time), -1).T]
     return np.stack(columns, axis=-1).reshape(len(grid), *values.shape[1:])
+
+
+def turns_freely(model: mujoco.MjModel, joint: str) -> bool:
+    """Return whether a joint is a hinge without a range, which may turn several times."""
+    found = model.joint(joint)
+    return bool(found.type[0] == mujoco.mjtJoint.mjJNT_HINGE and not model.jnt_limited[found.id])
+
+
+def count_turns(angle: Float[np.ndarray, " T"]) -> Float[np.ndarray, " T"]:
+    """Return the angle (rad) of a hinge without jumps of a full turn, if it restarts each turn. NaN stays NaN.
+
+    An angle that spans more than a full turn counts its turns already, and is returned unchanged.
+    """
+    seen = ~np.isnan(angle)
+    if not seen.any() or np.ptp(angle[seen]) >= 2 * np.pi + _TURN_TOLERANCE:
+        return angle
+    counted = angle.copy()
+    counted[seen] = np.unwrap(angle[seen])
+    return counted
+
+
+def unwound(model: mujoco.MjModel, joint: str, angle: Float[np.ndarray, " T"]) -> Float[np.ndarray, " T"]:
+    """Return a joint's values, by `count_turns` if it is a hinge without a range."""
+    return count_turns(angle) if turns_freely(model, joint) else angle
 
 
 def control_grid(recording: Recording, control_timestep: float) -> tuple[int, Float[np.ndarray, " T"]]:

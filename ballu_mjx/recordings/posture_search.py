@@ -1,7 +1,8 @@
 """Search for the posture of each sample, if its measurements fit several. Inverse kinematics starts from the result.
 
 Some samples along the recording, the anchors, are fitted from several starting poses. Dynamic programming selects the
-sequence of results that fits best and moves least. Other samples start between their neighbouring anchors.
+sequence of results that fits best and moves least. Other samples start between their neighbouring anchors. A hinge
+without a range may turn by more than half a turn between two anchors, so its turns are counted from sample to sample.
 """
 
 from __future__ import annotations
@@ -39,7 +40,7 @@ class PostureSearch:
         self._has_keyframe = solver.problem.robot.keyframe is not None or solver.problem.model.nkey > 0
 
     def solve(self) -> Float[np.ndarray, "T nq"]:
-        """Return the poses of all samples.
+        """Return the poses of all samples. Hidden hinges without a range do not jump by full turns.
 
         The solver's `bounded` is False afterwards if some sample fits no pose within the joints' ranges.
         """
@@ -52,7 +53,30 @@ class PostureSearch:
             anchors = np.unique(np.append(rows[:: max(1, round(_ANCHOR_INTERVAL / grid.step))], count - 1))
             found = self._anchor_joints(start, anchors)
             joints = np.stack([np.interp(rows, anchors, column) for column in found.T], axis=1)
-        return self._solver.fit(self._solver.guess(start, joints, rows), rows)[0]
+        qpos, cost = self._solver.fit(self._solver.guess(start, joints, rows), rows)
+        turning = self._solver.hidden[self._solver.turns[self._solver.hidden]]
+        if len(turning):
+            self._start_from_neighbours(start, qpos, cost)
+            columns = self._solver.addresses[turning]
+            qpos[:, columns] = np.unwrap(qpos[:, columns], axis=0)
+        return qpos
+
+    def _start_from_neighbours(
+        self, start: Float[np.ndarray, " nq"], qpos: Float[np.ndarray, "T nq"], cost: Float[np.ndarray, " T"]
+    ) -> None:
+        """Fit the samples that were not found again, from the samples beside them, in place.
+
+        A hinge that starts half a turn away from its angle is at a maximum of the misfit, and may stay there.
+        """
+        limit = _LARGEST_MISFIT * self._solver.measurements
+        for step in (-1, 1):
+            lost = np.flatnonzero(cost > limit)
+            if not len(lost):
+                break
+            beside = qpos[np.clip(lost + step, 0, len(qpos) - 1)][:, self._solver.addresses]
+            again, misfit = self._solver.fit(self._solver.guess(start, beside, lost), lost)
+            found = misfit <= limit
+            qpos[lost[found]], cost[lost[found]] = again[found], misfit[found]
 
     def _anchor_joints(
         self, start: Float[np.ndarray, " nq"], anchors: Int[np.ndarray, " A"]

@@ -29,6 +29,7 @@ from ballu_mjx.recordings.filters import (
     savitzky_golay,
     sign_continuous,
     smooth_rotation,
+    unwound,
 )
 from ballu_mjx.recordings.inverse_kinematics import solve_inverse_kinematics
 from ballu_mjx.recordings.kinematic_tree import KinematicTree
@@ -44,8 +45,6 @@ joints into them."""
 _OVERSHOOT = {False: 0.05, True: 5e-3}
 """Largest distance beyond the range that noise and filters explain, for a hinge (False, rad) or a slide (True, m).
 Joints farther beyond their range keep their fitted values."""
-_TURN_TOLERANCE = 0.1
-"""Tolerance (rad) by which angles that restart from 0 each turn may span more than a full turn."""
 
 
 def reconstruct(
@@ -131,13 +130,6 @@ def resample(recording: Recording, model: mujoco.MjModel, robot: RobotDescriptio
         | {point: unit(value) for point, value in recording.orientations.items()},
         joint_angles={joint: linear(unwound(model, joint, value)) for joint, value in recording.joint_angles.items()},
     )
-
-
-def unwound(model: mujoco.MjModel, joint: str, angle: Float[np.ndarray, " T"]) -> Float[np.ndarray, " T"]:
-    """Return an unlimited hinge's angle without jumps, if the recording counts each turn from 0 again."""
-    hinge = model.joint(joint)
-    turns = hinge.type[0] == mujoco.mjtJoint.mjJNT_HINGE and not model.jnt_limited[hinge.id]
-    return np.unwrap(angle) if turns and np.ptp(angle) < 2 * np.pi + _TURN_TOLERANCE else angle
 
 
 def differentiate(

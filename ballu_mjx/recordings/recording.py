@@ -26,7 +26,8 @@ class Recording:
     """A recording of a robot with T samples, in the world frame (z up), in SI units and radians.
 
     A recording from `read_recording` has strictly increasing times, no missing values, and unit quaternions without
-    jumps of sign. A recording to be written may hold NaN for missing samples.
+    jumps of sign. The angles of its hinges without a range do not restart each turn. A recording to be written may hold
+    NaN for missing samples.
     """
 
     name: str

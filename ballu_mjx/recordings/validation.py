@@ -94,11 +94,8 @@ def check_time(path: Path, time: Column, robot: RobotDescription) -> None:
         backwards = f"time runs back, from {time[row]:g} to {time[row + 1]:g} s"
         problem = "time stands still" if steps[row] == 0 else backwards
         refuse_recording(path, problem, "sort the rows by time and delete repeated ones", column="time", row=row + 1)
-    if len(steps) and np.median(steps) > 1.001 * robot.control_timestep:
-        problem = (
-            f"{1 / np.median(steps):.3g} samples per second are fewer than {1 / robot.control_timestep:.3g}, one per "
-            "control step"
-        )
+    problem = describe_slow(steps, robot.control_timestep)
+    if problem is not None:
         refuse_recording(path, problem, "record faster, or convert to seconds if this is milliseconds", column="time")
     long = steps[(steps > _BURST * np.median(steps)) & (steps <= LONGEST_GAP)] if len(steps) else steps
     if long.sum() > _LARGEST_BURST_SHARE * (time[-1] - time[0]):
@@ -112,6 +109,14 @@ def check_time(path: Path, time: Column, robot: RobotDescription) -> None:
     if time[-1] - time[0] < SHORTEST * (1 - 1e-6):
         problem = f"{time[-1] - time[0]:.3g} s are shorter than {SHORTEST:g} s"
         refuse_recording(path, problem, "record longer or leave it out", column="time", row=len(time) - 1)
+
+
+def describe_slow(steps: Float[np.ndarray, " steps"], control_timestep: float) -> str | None:
+    """Return the problem if most `steps` (s) between samples are longer than a control step. None if they are not."""
+    if not len(steps) or np.median(steps) <= 1.001 * control_timestep:
+        return None
+    rate, least = 1 / np.median(steps), 1 / control_timestep
+    return f"{rate:.3g} samples per second are fewer than {least:.3g}, one per control step"
 
 
 def check_cells(

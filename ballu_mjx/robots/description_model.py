@@ -103,7 +103,8 @@ _ONE_DIRECTION = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SL
 def check_sites(path: Path, model: mujoco.MjModel, tracked: str, points: tuple[str, ...]) -> None:
     """Check the tracked site and the points.
 
-    **Raises** `InputError` if a site is missing, does not move, or belongs to another robot than the tracked site.
+    **Raises** `InputError` if a site is missing, does not move, or belongs to another robot than the tracked site, and
+    if the model has a free joint that does not move the tracked site.
     """
     linked, roots = linked_roots(model), []
     for key, site in (("tracked", tracked), *(("points", point) for point in points)):
@@ -115,6 +116,10 @@ def check_sites(path: Path, model: mujoco.MjModel, tracked: str, points: tuple[s
             problem = f'"{key}" names {shown(site)}, which belongs to another robot than {tracked}'
             fix = "name sites below one child of the world body, or connect their bodies by an equality"
             refuse(path, problem, fix)
+    root = model.body_rootid[model.site(tracked).bodyid[0]]
+    if model.jnt_type[0] == mujoco.mjtJoint.mjJNT_FREE and model.jnt_bodyid[0] != root:
+        problem = f'"model" has a free joint that does not move the site {tracked}, {shown(model.joint(0).name)}'
+        refuse(path, problem, "remove it, since objects of the scene cannot move freely, or track a site of its body")
 
 
 def check_actuators(

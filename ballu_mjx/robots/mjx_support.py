@@ -28,7 +28,7 @@ def find_unsupported(model: mujoco.MjModel) -> tuple[str, str] | None:
 
 
 def _options(model: mujoco.MjModel) -> tuple[str, str] | None:
-    """Check integrator, solver, fluid and friction cones."""
+    """Check integrator, solver, passive forces, fluid and friction cones."""
     option = model.opt
     for name, value, kind, known in (
         ("integrator", option.integrator, mujoco.mjtIntegrator, mjx.IntegratorType),
@@ -37,6 +37,10 @@ def _options(model: mujoco.MjModel) -> tuple[str, str] | None:
         if value not in set(known):
             usual = "implicitfast or Euler" if name == "integrator" else "Newton or CG"
             return f'it has the {name} "{_word(kind(value))}"', f'write {name}="{usual.split()[0]}" ({usual})'
+    if option.noslip_iterations > 0:
+        return f'it has noslip_iterations="{option.noslip_iterations}", which MJX would ignore', "remove it"
+    if (passive := _passive_flags(model)) is not None:
+        return passive
     fluid = option.density > 0 or option.viscosity > 0 or np.any(option.wind)
     if fluid and option.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
         problem = 'it has a fluid (density, viscosity or wind) together with integrator="implicitfast"'
@@ -49,10 +53,31 @@ def _options(model: mujoco.MjModel) -> tuple[str, str] | None:
     return None
 
 
+def _passive_flags(model: mujoco.MjModel) -> tuple[str, str] | None:
+    """Check the flags that disable springs and damping.
+
+    MJX leaves out all passive forces if one of the flags is set, MuJoCo only if both are. In its Euler integrator, MJX
+    damps joints although damping is disabled, unless `eulerdamp` is disabled too.
+    """
+    bits, disabled = mujoco.mjtDisableBit, model.opt.disableflags
+    spring, damper = bool(disabled & bits.mjDSBL_SPRING), bool(disabled & bits.mjDSBL_DAMPER)
+    if spring != damper:
+        flag, number = ("spring", "stiffness") if spring else ("damper", "damping")
+        problem = f'it disables "{flag}" alone, for which MJX would leave out all passive forces'
+        return problem, f"remove the flag, and the {number} of joints and tendons"
+    euler = model.opt.integrator == mujoco.mjtIntegrator.mjINT_EULER and not disabled & bits.mjDSBL_EULERDAMP
+    if damper and euler and np.any(model.dof_damping):
+        problem = 'it disables "damper" together with integrator="Euler", in which MJX would damp joints nevertheless'
+        return problem, 'add eulerdamp="disable" to its flags'
+    return None
+
+
 def _parts(model: mujoco.MjModel) -> tuple[str, str] | None:
-    """Check deformable parts, equalities, sensors and actuators."""
+    """Check deformable parts, plugins, equalities, sensors and actuators."""
     if model.nflex:
         return "it has deformable parts (flex)", "replace them by rigid bodies"
+    if model.nplugin:
+        return f"it has the plugin {_name(model, mujoco.mjtObj.mjOBJ_PLUGIN, 0)}, which MJX would ignore", "remove it"
     own, actuator = mujoco.mjtObj, mujoco.mjtObj.mjOBJ_ACTUATOR
     for what, kinds, known, kind, named, fix in (
         ("an equality", model.eq_type, mjx.EqType, mujoco.mjtEq, own.mjOBJ_EQUALITY, "use connect, weld or joint"),

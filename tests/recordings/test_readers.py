@@ -43,8 +43,9 @@ from scipy.spatial.transform import Rotation
 from ballu_mjx.cli import record
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.csv_format import read_recording
+from ballu_mjx.recordings.importers.capture import read_commands
 from ballu_mjx.recordings.importers.mapping import Clock, RoomMapping, read_mapping
-from ballu_mjx.recordings.importers.readers import READERS, find_reader, read_capture
+from ballu_mjx.recordings.importers.readers import READERS, find_reader, open_log, read_capture
 from ballu_mjx.recordings.importers.table import Table
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.robots.description import RobotDescription
@@ -328,6 +329,45 @@ def test_commands_of_a_motive_take_are_read_from_a_bag(tmp_path: Path, robot: Ro
     line = ["--mapping", mapping, "--output", tmp_path / "out.csv", "--robot", robot.file, "--commands", log]
     run("import", take, *line, f"--offset={-(START + ARRIVAL_DELAY) * 1e-9 - 1e-4:.6f}")
     assert_motion(read_recording(tmp_path / "out.csv", robot), gaps=True)
+
+
+def test_log_replaces_the_commands_of_the_capture(tmp_path: Path, robot: RobotDescription):
+    """One column of the capture has the name of a command, but other values."""
+    path = write_npz(tmp_path)
+    with np.load(path) as archive:
+        kept = {name: archive[name] for name in archive.files if not name.startswith("command_")}
+    np.savez(path, **kept, command_arm=100 * TIME)
+    mapping = room(tmp_path, robot, ARCHIVE).path
+    line = ["--mapping", mapping, "--output", tmp_path / "out.csv", "--robot", robot.file]
+    run("import", path, *line, "--commands", write_log(tmp_path), "--offset", 0)
+    assert_motion(read_recording(tmp_path / "out.csv", robot), gaps=True)
+
+
+@pytest.mark.parametrize(
+    ("write", "commands", "words"),
+    [
+        (write_bag, 'arm = "/cmd:data[0]"\npush = "/cmd:data[1]"\n', 'write time = "received" under [commands] in'),
+        (
+            lambda folder: write_lerobot(folder, episodes=2),
+            'time = "timestamp"\narm = "action[0]"\npush = "action[1]"\n',
+            "holds 2 episodes, 0 to 1; give the commands of one episode as a table",
+        ),
+    ],
+)
+def test_message_about_a_log_does_not_name_the_keys_of_the_capture(
+    tmp_path: Path, robot: RobotDescription, write: Callable[[Path], Path], commands: str, words: str
+):
+    mapping = room(tmp_path, robot, NAMED, commands=commands)
+    with pytest.raises(InputError) as refused:
+        read_commands(open_log(write(tmp_path), mapping), mapping.commands, mapping)
+    assert words in str(refused.value) and "[clock]" not in str(refused.value)
+
+
+def test_message_about_a_capture_names_its_table(tmp_path: Path, robot: RobotDescription):
+    text = BAG + '[clock]\ntime = "header"\n'
+    mapping = room(tmp_path, robot, text, commands='arm = "/cmd:data[0]"\npush = "/cmd:data[1]"\n')
+    with pytest.raises(InputError, match=r'/cmd: not all of .*; write time = "received" under \[clock\] in'):
+        read_capture(write_bag(tmp_path), mapping)
 
 
 def test_mcap_with_json_messages_is_imported(tmp_path: Path, robot: RobotDescription):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +63,19 @@ def test_recording_with_all_described_quantities_is_read_back(tmp_path: Path):
     np.testing.assert_allclose(found.orientations["elbow"], expected.orientations["elbow"], atol=6e-5)
     for joint in robot.joints:
         np.testing.assert_allclose(found.joint_angles[joint], expected.joint_angles[joint], atol=6e-6)
+
+
+@pytest.mark.parametrize(
+    ("low", "high"), [(-0.523599, 0.174533), (-3.14159, 3.14159), (-math.pi / 6, 1 / 3), (0.000123454321, 0.0009)]
+)
+def test_commands_at_the_bounds_of_their_range_are_read_back(tmp_path: Path, low: float, high: float):
+    """The bounds have more decimals than a file keeps, or than a log in single precision has."""
+    robot = describe(tmp_path, commands={"turn": {"actuator": "turn", "range": [low, high]}, "push": "push"})
+    turn = np.resize([low, high, (low + high) / 2, float(np.float32(low)), float(np.float32(high))], len(swing().time))
+    expected = dataclasses.replace(swing(), command=np.stack([turn, swing().command[:, 1]], axis=1))
+    write_recording(expected, tmp_path / "swing.csv", robot)
+    found = read_recording(tmp_path / "swing.csv", robot)
+    np.testing.assert_allclose(found.command[:, 0], turn, atol=1e-4 * (high - low))
 
 
 def test_free_recordings_need_no_joints_and_suspended_ones_need_only_joints(tmp_path: Path):

@@ -146,6 +146,7 @@ SWIVEL = '<joint name="swivel" axis="0 0 1" stiffness="0.008"/>'
         (in_json(commands={"left": {"actuator": "propeller_left"}, "right": "propeller_right"}), "for left"),
         (in_model(SWIVEL, '<joint name="swivel" type="ball"/>'), "a ball joint"),
         (in_model("</worldbody>", BUOY + "</worldbody>"), "a free joint that is not the first joint, 'afloat'"),
+        (in_model("<worldbody>", "<worldbody>" + BUOY), "a free joint that does not move the site balloon, 'afloat'"),
         (in_model('timestep="0.01"', 'timestep="0.015"'), "divide the control step"),
         (in_model('ctrlrange="0 1"', 'ctrllimited="false"'), "has no ctrlrange"),
         (in_model('<body name="lower"', '<site name="tripod"/><body name="lower"'), ""),

@@ -9,7 +9,7 @@ import pytest
 from ballu_mjx.robots.mjx_support import LARGEST_HULL, LARGEST_PAIR, check_mjx
 
 MODEL = """
-<mujoco><option timestep="0.01" OPTION/><asset>ASSET</asset>
+<mujoco>PLUGIN<option timestep="0.01" OPTION><flag FLAG/></option><asset>ASSET</asset>
 <worldbody><geom name="floor" type="plane" size="0 0 0.1"/>
   <body name="trunk" pos="0 0 1"><freejoint/><geom name="trunk" size="0.1" contype="0" conaffinity="0"/>
     <site name="imu"/>
@@ -23,7 +23,9 @@ MODEL = """
 def load(**parts: str) -> mujoco.MjModel:
     text = MODEL
     for key, default in (
+        ("PLUGIN", ""),
         ("OPTION", ""),
+        ("FLAG", ""),
         ("ASSET", ""),
         ("LEFT", 'size="0.02"'),
         ("RIGHT", 'size="0.02"'),
@@ -44,6 +46,10 @@ def ball(vertices: int, **more: str) -> str:
     return f'<mesh name="ball" vertex="{" ".join(f"{x:.6f}" for x in points.reshape(-1))}"{keys}/>'
 
 
+PID = (
+    '<extension><plugin plugin="mujoco.pid"><instance name="own"><config key="kp" value="3"/></instance></plugin>'
+    "</extension>"
+)
 MESH = 'name="foot" type="mesh" mesh="ball" mass="0.1"'
 
 
@@ -94,6 +100,13 @@ def test_visual_meshes_may_have_any_number_of_vertices():
         ({"motor": 'armature="0.01"'}, "the actuator m has an armature", "at the joint or tendon"),
         ({"motor": 'delay="0.02" nsample="4"'}, "the actuator m has a delay", "declare the delay"),
         ({"motor": 'dyntype="filter" dynprm="0.1" actearly="true"'}, 'm has "actearly"', "remove it"),
+        ({"flag": 'spring="disable"'}, 'it disables "spring" alone', 'remove the flag, and the stiffness'),
+        ({"flag": 'damper="disable"'}, 'it disables "damper" alone', 'remove the flag, and the damping'),
+        ({"flag": 'spring="disable" damper="disable"', "joint": 'damping="1"'}, 'it disables "damper" together with',
+         'add eulerdamp="disable"'),
+        ({"option": 'noslip_iterations="3"'}, "it has noslip_iterations", "remove it"),
+        ({"plugin": PID, "more": '<actuator><plugin joint="right" plugin="mujoco.pid" instance="own"/></actuator>'},
+         "it has the plugin own", "remove it"),
         ({"option": 'actuatorgroupdisable="0 2"', "motor": 'group="2"'}, "the actuator group 2", "remove the group's"),
     ],
 )  # fmt: skip
@@ -108,4 +121,8 @@ def test_features_that_mjx_simulates_are_accepted():
         'actuatorgroupdisable="1"',
     ):  # fmt: skip
         assert check_mjx(load(option=option)) is None
+    both = 'spring="disable" damper="disable"'
+    assert check_mjx(load(flag=both)) is None
+    assert check_mjx(load(flag=both + ' eulerdamp="disable"', joint='damping="1"')) is None
+    assert check_mjx(load(flag=both, option='integrator="implicitfast"', joint='damping="1"')) is None
     assert check_mjx(load(left='size="0.02" fluidshape="ellipsoid"')) is None, "without a fluid, it has no effect"

@@ -177,7 +177,8 @@ def open_lerobot(path: Path, mapping: RoomMapping | None) -> Capture:
     if episode is None and len(present) > 1:
         problem = f"holds {len(present)} episodes, {min(present)} to {max(present)}"
         if mapping is not None:
-            refuse(path, "", problem, f"select one by episode = ... under [clock] in {mapping.path}")
+            own = f"select one by episode = ... under [clock] in {mapping.path}"
+            refuse(path, "", problem, "give the commands of one episode as a table" if mapping.clock.log else own)
         notes.append(f"It {problem}; this list is of episode {min(present)}.")
     elif episode is not None and episode not in present:
         problem = f"there is no episode {episode}"

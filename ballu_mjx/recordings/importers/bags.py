@@ -24,7 +24,7 @@ import numpy as np
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.importers.capture import Capture, Lazy, Series, Stream
-from ballu_mjx.recordings.importers.mapping import RoomMapping
+from ballu_mjx.recordings.importers.mapping import Clock, RoomMapping
 from ballu_mjx.recordings.importers.trajectories import LENGTHS, refuse, shorten, to_quaternion
 
 HEADER, RECEIVED = "header", "received"
@@ -77,10 +77,10 @@ def open_bag(path: Path, mapping: RoomMapping | None) -> Capture:
     """
     if not path.exists():
         refuse(path, "", "there is no such file or folder", "check the path")
-    clock = _EITHER if mapping is None else mapping.clock.time
-    if clock not in (None, HEADER, RECEIVED, _EITHER) or (mapping is not None and clock == _EITHER):
+    clock = Clock(_EITHER) if mapping is None else mapping.clock
+    if mapping is not None and clock.time not in (None, HEADER, RECEIVED):
         fix = f'write "{HEADER}" (stamps of the messages) or "{RECEIVED}" (times of recording)'
-        refuse(mapping.path if mapping else path, "[clock] time", f"a bag has no column {shorten(clock)!r}", fix)
+        refuse(mapping.path, "[clock] time", f"a bag has no column {shorten(clock.time)!r}", fix)
     length = 1.0 if mapping is None or mapping.length is None else LENGTHS[mapping.length]
     topics = _mcap_topics(path) if path.suffix.lower() == ".mcap" else _bag_topics(path)
     bodies: dict[str, Callable[[], Stream]] = {}
@@ -222,21 +222,23 @@ def _decode(path: Path, topic: _Topic, of: Callable[..., Any]) -> dict[str, _Dec
     return found
 
 
-def _times(path: Path, name: str, decoded: _Decoded, clock: str | None) -> tuple[np.ndarray, str]:
+def _times(path: Path, name: str, decoded: _Decoded, clock: Clock) -> tuple[np.ndarray, str]:
     """Return the times (s) of a topic, and the name of their clock."""
-    if clock == _EITHER:
-        clock = RECEIVED if decoded.stamped is None else HEADER
-    if clock != RECEIVED and decoded.stamped is None:
-        fix = f'write time = "{RECEIVED}" under [clock] in the mapping, the times of recording'
+    chosen = clock.time or HEADER
+    if chosen == _EITHER:
+        chosen = RECEIVED if decoded.stamped is None else HEADER
+    if chosen != RECEIVED and decoded.stamped is None:
+        fix = f'write time = "{RECEIVED}" under {clock.table} in the mapping, the times of recording'
         refuse(path, shorten(name), "not all of its messages have a stamp in a header", fix)
-    ns = decoded.received if clock == RECEIVED or decoded.stamped is None else decoded.stamped
+    ns = decoded.received if chosen == RECEIVED or decoded.stamped is None else decoded.stamped
     back = np.diff(ns) <= 0
     if back.any():
         row = int(back.argmax()) + 1
-        other = RECEIVED if clock != RECEIVED else HEADER
+        other = RECEIVED if chosen != RECEIVED else HEADER
         problem = f"time runs back or stands still at message {row + 1}, by {(ns[row - 1] - ns[row]) * 1e-9:.6f} s"
-        refuse(path, shorten(name), problem, f'try time = "{other}" under [clock] in the mapping, or cut the bag')
-    return ns * 1e-9, clock or HEADER
+        fix = f'try time = "{other}" under {clock.table} in the mapping, or cut the bag'
+        refuse(path, shorten(name), problem, fix)
+    return ns * 1e-9, chosen
 
 
 def _stream(
@@ -244,7 +246,7 @@ def _stream(
     topic: _Topic,
     decode: Callable[[], Mapping[str, _Decoded]],
     name: str,
-    clock: str | None,
+    clock: Clock,
     length: float,
 ) -> Stream:
     decoded = decode().get(name)
@@ -260,9 +262,7 @@ def _stream(
     return Stream(time, table[:, :3] * length, quaternion, clock=known)
 
 
-def _series(
-    path: Path, topic: _Topic, decode: Callable[[], Mapping[str, _Decoded]], name: str, clock: str | None
-) -> Series:
+def _series(path: Path, topic: _Topic, decode: Callable[[], Mapping[str, _Decoded]], name: str, clock: Clock) -> Series:
     decoded = decode()[topic.name]
     values = decoded.values[name]
     if np.isinf(values).any():

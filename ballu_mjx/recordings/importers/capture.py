@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -12,6 +12,7 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation, Slerp
 
 from ballu_mjx.common.errors import InputError
+from ballu_mjx.recordings.filters import count_turns
 from ballu_mjx.recordings.importers.contents import Contents, Item
 from ballu_mjx.recordings.importers.mapping import MARKER_TOLERANCE, Commands, Joint, RoomMapping, Source
 from ballu_mjx.recordings.importers.trajectories import (
@@ -27,13 +28,15 @@ from ballu_mjx.recordings.importers.trajectories import (
     suggest,
     to_quaternion,
 )
+from ballu_mjx.recordings.validation import LONGEST_GAP, describe_slow
 
 _COMMAND_TOLERANCE = 0.005
 """Tolerance as a share of a command's range. Values outside by at most this much count as noise and are clipped."""
 _COMMENT_SIGNS = "#% "
 """Characters that may precede the first name of a header. `rostopic echo -p` writes "%time"."""
 _LONGEST_BRIDGE = 2.5
-"""Longest gap over which a stream is interpolated, in sample spacings. In longer gaps the values are NaN (not seen)."""
+"""Longest gap over which a stream is interpolated, in sample spacings. `LONGEST_GAP` limits it too. In longer gaps the
+values are NaN (not seen)."""
 
 _Value = TypeVar("_Value")
 
@@ -182,19 +185,23 @@ def _step(values: np.ndarray) -> float | None:
 def select(capture: Capture, mapping: RoomMapping) -> Trajectories:
     """Return the parts of `capture` that `mapping` selects, at the times of the first site, or else of the first joint.
 
-    Streams with other times are interpolated, and orientations along the shortest rotation.
+    Streams with other times are interpolated, orientations along the shortest rotation. If the angle of a hinge without
+    a range restarts each turn, its turns are counted before it is interpolated.
 
-    **Raises** `InputError` if a selected part is not in the file, has no unit, or lacks times.
+    **Raises** `InputError` if a selected part is not in the file, has no unit, or lacks times, and if an interpolated
+    stream has less than one sample per control step.
     """
     picked = {role: _pick(capture, mapping, source) for role, source in mapping.sources.items()}
     joints = {name: _joint(capture, mapping, joint) for name, joint in mapping.joints.items()}
-    clocks = [stream.time for stream in picked.values()] + [time for time, _ in joints.values()]
+    clocks = [(mapping.sources[role].body or role, stream.time) for role, stream in picked.items()]
+    clocks += [(mapping.joints[name].column, time) for name, (time, _) in joints.items()]
     if not clocks:
         fix = "give a source for its sites or its joints"
         refuse(mapping.path, "", f"it selects nothing from {capture.program}", fix)
-    time = clocks[0]
+    time = clocks[0][1]
+    _check_rates(capture, mapping, clocks, time)
     bodies = {role: _on_clock(stream, time) for role, stream in picked.items()}
-    angles = {name: _values_on_clock(each, values, time) for name, (each, values) in joints.items()}
+    angles = {name: _angles_on_clock(mapping.joints[name], *each, time) for name, each in joints.items()}
     commands = None
     if any(_find_column(capture, name) is not None for name in mapping.commands.columns.values()):
         commands = CommandLog(*_commands(capture, mapping.commands, mapping, log=False))
@@ -229,6 +236,7 @@ def _pick(capture: Capture, mapping: RoomMapping, source: Source) -> Stream:
     if source.markers:
         streams = [named(name) for name in source.markers]
         time = streams[0].time
+        _check_rates(capture, mapping, zip(source.markers, [stream.time for stream in streams], strict=True), time)
         markers = np.stack([_on_clock(stream, time).position for stream in streams])
         geometry = None if source.geometry is None else np.array(source.geometry)
         body = rigid_body(capture.path, source.role, markers, geometry, MARKER_TOLERANCE)
@@ -251,18 +259,27 @@ def _pick(capture: Capture, mapping: RoomMapping, source: Source) -> Stream:
 
 
 def _from_columns(capture: Capture, mapping: RoomMapping, source: Source) -> Stream:
-    parts = [_column(capture, mapping, name) for name in (*source.position, *source.orientation)]
-    time = parts[0][0]
-    values = np.stack([_values_on_clock(each, series.values, time) for each, series in parts], axis=1)
-    position = values[:, :3] * _unit(capture, mapping, parts[0][1], LENGTHS, "length")
+    names = (*source.position, *source.orientation)
+    parts = [_column(capture, mapping, name) for name in names]
+    places, turns = parts[:3], parts[3:]
+    time = places[0][0]
+    _check_rates(capture, mapping, zip(names, [own for own, _ in parts], strict=True), time)
+    position = np.stack([_values_on_clock(own, series.values, time) for own, series in places], axis=1)
+    position *= _unit(capture, mapping, places[0][1], LENGTHS, "length")
     if not source.orientation:
         return Stream(time, position)
     assert source.rotation is not None
-    unit = 1.0 if source.rotation == "quaternion" else _unit(capture, mapping, parts[3][1], ANGLES, "angle")
     place = f"columns {source.orientation[0]} to {source.orientation[-1]}"
+    clock = turns[0][0]
+    if not all(_same(own, clock) for own, _ in turns):
+        # Components must not be interpolated one by one: quaternions may change their sign, and angles may restart.
+        fix = "give columns of one topic, or convert the file to a table"
+        refuse(capture.path, place, "their times differ", fix)
+    unit = 1.0 if source.rotation == "quaternion" else _unit(capture, mapping, turns[0][1], ANGLES, "angle")
+    values = np.stack([series.values for _, series in turns], axis=1)
     fix = f"export unit quaternions, or fix the order of the columns in {mapping.path}"
-    quaternion = to_quaternion(capture.path, place, values[:, 3:], source.rotation, unit, fix=fix)
-    return Stream(time, position, quaternion)
+    quaternion = to_quaternion(capture.path, place, values, source.rotation, unit, fix=fix)
+    return Stream(time, position, _rotations_on_clock(clock, quaternion, time))
 
 
 def _joint(capture: Capture, mapping: RoomMapping, joint: Joint) -> tuple[np.ndarray, np.ndarray]:
@@ -391,25 +408,39 @@ def _share(
 # ---- interpolation to one clock ----
 
 
+def _check_rates(
+    capture: Capture,
+    mapping: RoomMapping,
+    clocks: Iterable[tuple[str, Float[np.ndarray, " _"]]],
+    time: Float[np.ndarray, " T"],
+) -> None:
+    """Refuse streams that are slower than the control step.
+
+    `clocks`: names and times of the streams. Those with the clock `time` are not interpolated, and are checked with the
+    recording.
+    """
+    for name, own in clocks:
+        problem = None if _same(own, time) else describe_slow(np.diff(own), mapping.control_timestep)
+        if problem is not None:
+            refuse(capture.path, shorten(name), problem, "record it faster")
+
+
+def _same(own: np.ndarray, time: np.ndarray) -> bool:
+    """Return whether two clocks are equal."""
+    return own is time or np.array_equal(own, time)
+
+
 def _on_clock(stream: Stream, time: Float[np.ndarray, " T"]) -> Body:
     """Return a stream interpolated to `time`."""
-    if stream.time is time or np.array_equal(stream.time, time):
-        return Body(stream.position, stream.quaternion)
     position = np.stack([_values_on_clock(stream.time, axis, time) for axis in stream.position.T], axis=1)
     if stream.quaternion is None:
         return Body(position)
-    quaternion = np.full((len(time), 4), np.nan)
-    seen = np.flatnonzero(~np.isnan(stream.quaternion).any(axis=1))
-    inside = _bridged(stream.time, seen, time)
-    if inside.any():
-        turned = Rotation.from_quat(stream.quaternion[seen], scalar_first=True)
-        quaternion[inside] = Slerp(stream.time[seen], turned)(time[inside]).as_quat(scalar_first=True)
-    return Body(position, quaternion)
+    return Body(position, _rotations_on_clock(stream.time, stream.quaternion, time))
 
 
 def _values_on_clock(own: np.ndarray, values: np.ndarray, time: np.ndarray) -> np.ndarray:
     """Return values at the times `own` interpolated to `time`."""
-    if own is time or np.array_equal(own, time):
+    if _same(own, time):
         return values
     found = np.full(len(time), np.nan)
     seen = np.flatnonzero(~np.isnan(values))
@@ -419,12 +450,36 @@ def _values_on_clock(own: np.ndarray, values: np.ndarray, time: np.ndarray) -> n
     return found
 
 
+def _angles_on_clock(joint: Joint, own: np.ndarray, values: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """Return a joint's values at the times `own` interpolated to `time`."""
+    if _same(own, time):
+        return values
+    return _values_on_clock(own, count_turns(values) if joint.turns else values, time)
+
+
+def _rotations_on_clock(
+    own: Float[np.ndarray, " N"], quaternion: Float[np.ndarray, "N 4"], time: Float[np.ndarray, " T"]
+) -> Float[np.ndarray, "T 4"]:
+    """Return orientations at the times `own` interpolated to `time`, along the shortest rotation."""
+    if _same(own, time):
+        return quaternion
+    found = np.full((len(time), 4), np.nan)
+    seen = np.flatnonzero(~np.isnan(quaternion).any(axis=1))
+    inside = _bridged(own, seen, time)
+    if inside.any():
+        turned = Rotation.from_quat(quaternion[seen], scalar_first=True)
+        found[inside] = Slerp(own[seen], turned)(time[inside]).as_quat(scalar_first=True)
+    return found
+
+
 def _bridged(own: np.ndarray, seen: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """Return which of `time` lie between two seen samples with a gap of at most `_LONGEST_BRIDGE` spacings."""
+    """Return which of `time` lie between two seen samples, with a gap of at most `_LONGEST_BRIDGE` spacings and
+    `LONGEST_GAP`."""
     if len(seen) < 2:
         return np.zeros(len(time), bool)
     known = own[seen]
     after = np.clip(np.searchsorted(known, time), 1, len(known) - 1)
     step = known[after] - known[after - 1]
-    longest = _LONGEST_BRIDGE * max(float(np.median(np.diff(own))), float(np.median(np.diff(time))))
+    spacing = max(float(np.median(np.diff(own))), float(np.median(np.diff(time))))
+    longest = min(_LONGEST_BRIDGE * spacing, LONGEST_GAP)
     return (time >= known[0] - 1e-9) & (time <= known[-1] + 1e-9) & (step <= longest)

@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import is_number
+from ballu_mjx.recordings.filters import turns_freely
 from ballu_mjx.recordings.importers.trajectories import ANGLES, LENGTHS, TIMES, refuse, shorten, suggest
 from ballu_mjx.recordings.recording import Kind
 from ballu_mjx.recordings.recording_hooks import hooks_of
@@ -62,6 +63,8 @@ class Joint:
     zero: float
     slides: bool = False
     """Whether the joint is a slide, so that the column is a length."""
+    turns: bool = False
+    """Whether the joint is a hinge without a range. The column may then restart each turn."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,7 +91,7 @@ class Commands:
 
 @dataclasses.dataclass(frozen=True)
 class Clock:
-    """Source of the captured file's times."""
+    """Source of a file's times."""
 
     time: str | None = None
     """Time column, or "header" or "received" for a bag. None for the default of the format."""
@@ -96,6 +99,13 @@ class Clock:
     """Unit of the time column, if the format does not specify it."""
     episode: int | None = None
     """Number of the episode in a LeRobot dataset. None if it has only one."""
+    log: bool = False
+    """Whether the file is a command log. `time` is then a key of the table [commands], not of [clock]."""
+
+    @property
+    def table(self) -> str:
+        """Return the mapping's table with the key `time`, for messages."""
+        return "[commands]" if self.log else "[clock]"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,6 +135,8 @@ class RoomMapping:
     joints: Mapping[str, Joint]
     """Columns of joint angles by joint."""
     commands: Commands
+    control_timestep: float
+    """Control step (s) of the robot."""
 
 
 def read_mapping(path: Path, robot: RobotDescription) -> RoomMapping:
@@ -173,14 +185,15 @@ def read_mapping(path: Path, robot: RobotDescription) -> RoomMapping:
         if kind == "suspended" and name not in given:
             refuse(path, f"[{name}]", "the table is missing", f'give its column, such as column = "{name}"')
     model = robot.load_model()
-    joints = {name: _joint(top.keys(name), slides=_slides(model, name)) for name in given}
+    joints = {name: _joint(top.keys(name), model, name) for name in given}
     commands = _commands(top.keys("commands"), robot)
     top.taken |= {*roles, *robot.joints}
     top.finish()
     assert floor is not None
     return RoomMapping(
-        path, specimen, kind, notes, rate, axes, start, floor, length, angle, clock, sources, joints, commands
-    )
+        path, specimen, kind, notes, rate, axes, start, floor, length, angle, clock, sources, joints, commands,
+        robot.control_timestep,
+    )  # fmt: skip
 
 
 def _check_names(path: Path, roles: Sequence[str], robot: RobotDescription) -> None:
@@ -339,11 +352,7 @@ def _source(keys: _Keys, role: str) -> Source:
     return Source(role, body, section, rotation, markers, geometry, position, orientation, offset, turn)
 
 
-def _slides(model: mujoco.MjModel, joint: str) -> bool:
-    return bool(model.joint(joint).type[0] == mujoco.mjtJoint.mjJNT_SLIDE)
-
-
-def _joint(keys: _Keys, *, slides: bool) -> Joint:
+def _joint(keys: _Keys, model: mujoco.MjModel, name: str) -> Joint:
     column = keys.text("column")
     sign = keys.number("sign", 1.0)
     if sign not in (1.0, -1.0):
@@ -351,7 +360,8 @@ def _joint(keys: _Keys, *, slides: bool) -> Joint:
     zero = keys.number("zero", 0.0)
     keys.finish()
     assert sign is not None and zero is not None
-    return Joint(column, sign, zero, slides)
+    slides = bool(model.joint(name).type[0] == mujoco.mjtJoint.mjJNT_SLIDE)
+    return Joint(column, sign, zero, slides, turns_freely(model, name))
 
 
 def _clock(keys: _Keys, unit: str | None) -> Clock:

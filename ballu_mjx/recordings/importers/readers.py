@@ -107,8 +107,13 @@ def find_reader(path: Path, name: str | None = None) -> Reader:
     return found
 
 
-def read_capture(path: Path, mapping: RoomMapping, name: str | None = None) -> Trajectories:
-    """Return the parts of the file at `path` that `mapping` selects. `name` is the format; None to recognise it.
+def read_capture(path: Path, mapping: RoomMapping, name: str | None = None, *, has_log: bool = False) -> Trajectories:
+    """Return the parts of the file at `path` that `mapping` selects.
+
+    **Arguments**
+
+    - `name`: the format. None to recognise it.
+    - `has_log`: whether a command log belongs to the file. Commands in the file are then not read.
 
     **Raises** `InputError` if the file cannot be read, or lacks a selected part.
     """
@@ -125,6 +130,9 @@ def read_capture(path: Path, mapping: RoomMapping, name: str | None = None) -> T
         refuse(mapping.path, "rate", problem, "leave it out")
     if clock.episode is not None and reader.name != "lerobot":
         refuse(mapping.path, "[clock] episode", f"{path.name} is not a LeRobot dataset", "leave it out")
+    if has_log:
+        none = dataclasses.replace(mapping.commands, columns={}, limits=(), ranges=())
+        mapping = dataclasses.replace(mapping, commands=none)
     return reader.read(path, mapping)
 
 
@@ -138,4 +146,5 @@ def open_log(path: Path, mapping: RoomMapping) -> Capture:
         raise InputError(f"{path}: a {reader.program} holds no commands; give them as a table, an archive or a bag.")
     # [clock] is for the capture. The clock of the log is under [commands].
     own = mapping.commands.time if reader.name == "bag" and mapping.commands.time in ("header", "received") else None
-    return reader.open(path, dataclasses.replace(mapping, clock=dataclasses.replace(mapping.clock, time=own)))
+    clock = dataclasses.replace(mapping.clock, time=own, log=True)
+    return reader.open(path, dataclasses.replace(mapping, clock=clock))
