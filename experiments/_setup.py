@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -27,6 +28,20 @@ def prepare() -> None:
     from ballu_mjx.common import runtime
 
     runtime.prepare(brief="--quick" in sys.argv[1:])  # spends most of its time on compiling
+
+
+def parse(parser: argparse.ArgumentParser, output: Path, arguments: Sequence[str] | None = None) -> argparse.Namespace:
+    """Add the option `--output` to a parser that has `--quick`, and parse the command line, or `arguments`.
+
+    The default of `--output` is the folder `output`. With `--quick` it is a folder beside it, because finished
+    trainings are not repeated: a full run in the same folder would take those of the quick run.
+    """
+    quick = output.with_name(f"{output.name}-quick")
+    parser.add_argument("--output", type=Path, help=f"folder of all results ({output}, or {quick} under --quick)")
+    options = parser.parse_args(arguments)
+    if options.output is None:
+        options.output = quick if options.quick else output
+    return options
 
 
 def write_table(text: str, folder: Path) -> None:

@@ -168,10 +168,9 @@ def main() -> None:
     )
     parser.add_argument("--steps", type=int, default=1_200_000, help="control steps of each training")
     parser.add_argument("--fresh", type=int, default=7, help="seed of the recordings for measurement")
-    parser.add_argument("--output", type=Path, default=Path("runs/ablation"), help="folder of the results")
     parser.add_argument("--quick", action="store_true", help="two rows, trained for seconds; the numbers mean nothing")
     parser.add_argument("--results", type=Path, help="JSON file to write the table to")
-    options = parser.parse_args()
+    options = _setup.parse(parser, Path("runs/ablation"))
 
     training = list_bundled("training")
     rows, seeds, sizes = options.rows, options.seeds, Sizes(options.steps, 200_000, {})
@@ -184,7 +183,12 @@ def main() -> None:
     simulator = Simulator(load_robot(), identified)
     read = {"training": training, "validation": validation}
     motions = {
-        use: [reconstruct(read_recording(path, load_robot()), load_robot(), simulator.mj_model) for path in paths]
+        use: [
+            reconstruct(
+                read_recording(path, load_robot()), load_robot(), simulator.mj_model, drivetrain=simulator.drivetrain
+            )
+            for path in paths
+        ]
         for use, paths in read.items()
     }
     options.output.mkdir(parents=True, exist_ok=True)

@@ -34,7 +34,6 @@ from ballu_mjx.cli import train_sysid
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.runs.folder import read_config
 
-OUTPUT, QUICK_OUTPUT = Path("runs/actuator-curves"), Path("runs/actuator-curves-quick")
 FIGURE = "actuator_curves.png"
 """The last file that an identification writes."""
 
@@ -73,14 +72,10 @@ def identify(folder: Path, config: IdentificationConfig) -> None:
 # %%
 def main() -> None:
     parser = argparse.ArgumentParser(description="Make the paper's figure of the actuators from the bundled sweep.")
-    parser.add_argument(
-        "--output", type=Path, help=f"folder of the identification ({OUTPUT}, or {QUICK_OUTPUT} under --quick)"
-    )
     parser.add_argument("--quick", action="store_true", help="fit only settled angles, from fewer starts")
-    options = parser.parse_args()
-    folder = options.output or (QUICK_OUTPUT if options.quick else OUTPUT)
-    identify(folder, IdentificationConfig(**train_sysid.QUICK if options.quick else {}))
-    print(f"Figure: {folder / FIGURE}")
+    options = _setup.parse(parser, Path("runs/actuator-curves"))
+    identify(options.output, IdentificationConfig(**train_sysid.QUICK if options.quick else {}))
+    print(f"Figure: {options.output / FIGURE}")
 
 
 if __name__ == "__main__":

@@ -128,10 +128,9 @@ def legs_table(fits: dict[str, AirFit], true: dict[str, tuple[float, ...]]) -> T
 # %%
 def main() -> None:
     parser = argparse.ArgumentParser(description="Measure the bias of the identified air due to missing leg effects.")
-    parser.add_argument("--output", type=Path, default=Path("runs/air-bias"), help="folder of recordings and tables")
     parser.add_argument("--quick", action="store_true", help="use three gaits of two robots; the numbers mean little")
     parser.add_argument("--results", type=Path, help="JSON file to write the tables to")
-    options = parser.parse_args()
+    options = _setup.parse(parser, Path("runs/air-bias"))
 
     model = load_model(read_actuators(assets() / "recordings" / ACTUATORS_FILE)[1])
     full = virtual_robot.draw_robot(dataset.ROBOT_SEED)

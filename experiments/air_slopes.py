@@ -115,10 +115,9 @@ def main() -> None:
         description="Compare derivatives and finite differences of windows of motion with respect to the lift."
     )
     parser.add_argument("--air", type=Path, required=True, help="folder of a `train aerodynamic` run before the loss")
-    parser.add_argument("--output", type=Path, default=Path("runs/air-slopes"), help="folder of the table and figure")
     parser.add_argument("--quick", action="store_true", help="use only windows of 0.5 s")
     parser.add_argument("--results", type=Path, help="JSON file to write the table to")
-    options = parser.parse_args()
+    options = _setup.parse(parser, Path("runs/air-slopes"))
 
     known = TrainedResidual.load(options.air, load_robot())
     simulator = Simulator(load_robot(), known.actuators)
@@ -128,7 +127,7 @@ def main() -> None:
     lost = deflation.lift(LOSS * full.buoyancy)
     gait = next(job for job in dataset.jobs() if job.split == "training")
     recorded = deflation.recorded(gait, deflated, 2000, options.output / "recordings")
-    motions = [reconstruct(recorded, load_robot(), model)]
+    motions = [reconstruct(recorded, load_robot(), model, drivetrain=simulator.drivetrain)]
     # A delay of whole physics steps, at which the errors are differentiable.
     timestep = float(model.opt.timestep)
     delay = np.round(float(known.params.delay) / timestep) * timestep

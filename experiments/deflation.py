@@ -102,10 +102,9 @@ def main() -> None:
         "--anew", action="store_true", help="also identify all parameters of the air again; ten more minutes"
     )
     parser.add_argument("--fresh", type=int, default=2026, help="seed of the larger test set")
-    parser.add_argument("--output", type=Path, default=Path("runs/deflation"), help="folder of the run and the table")
     parser.add_argument("--quick", action="store_true", help="use one test gait; the numbers mean little")
     parser.add_argument("--results", type=Path, help="JSON file to write the tables to")
-    options = parser.parse_args()
+    options = _setup.parse(parser, Path("runs/deflation"))
 
     air = options.air
     if air is None:
@@ -122,7 +121,7 @@ def main() -> None:
     def motions(virtual: VirtualRobot, jobs: Sequence[dataset.Job], first: int, name: str) -> list[Motion]:
         folder = options.output / name
         recordings = [recorded(job, virtual, first + number, folder) for number, job in enumerate(jobs)]
-        return [reconstruct(each, load_robot(), model) for each in recordings]
+        return [reconstruct(each, load_robot(), model, drivetrain=simulator.drivetrain) for each in recordings]
 
     tests = tests[:1] if options.quick else tests
     before, after = motions(full, tests, 1000, "before"), motions(deflated, tests, 1000, "after")

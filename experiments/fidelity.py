@@ -12,7 +12,8 @@
 # - forces by gradients through the simulation (analytic);
 # - the air's parameters (aerodynamic): all of them, or all but the lift;
 # - networks in addition to the air (aerodynamic+analytic, aerodynamic+EnvMimic);
-# - for comparison, the command delay without air, and the air without delay and centre.
+# - for comparison, the command delay without air (unless the identified actuators have a delay), and the air without
+#   delay and centre.
 #
 # Each method is trained once for each seed. Finished runs are not repeated. Test recordings have gaits, other commands,
 # and, as in the paper, the actions of a walking policy that was trained in vanilla.
@@ -49,11 +50,13 @@ from ballu_mjx.common.results import Cell, Table
 from ballu_mjx.evaluation.errors import SCORE_HORIZONS, Errors, Evaluation
 from ballu_mjx.evaluation.errors_file import read_evaluation
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator, Replay
+from ballu_mjx.identification.actuators import read_actuators
 from ballu_mjx.policies.policy import Policy
 from ballu_mjx.recordings.csv_format import list_recordings, read_recording
 from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.recordings.recording_groups import OTHER
 from ballu_mjx.residuals.aerodynamics import AIR_PARAMETERS
+from ballu_mjx.residuals.aerodynamics_training import has_delay
 from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.robots.model import assets
 from ballu_mjx.robots.registry import load_robot
@@ -83,6 +86,8 @@ class Method:
 
 
 AIR = "aerodynamic"
+DELAY = AIR, "--free", "delay"
+"""Arguments of a training that identifies the delay alone."""
 
 
 def _air_without(*names: str) -> tuple[str, ...]:
@@ -104,7 +109,7 @@ METHODS = {
     "air-lift": Method("aerodynamic, the model's lift", _air_without("lift"), seeded=False),
     "air-analytic": Method("aerodynamic+analytic", ("analytic",), beside=AIR),
     "air-envmimic": Method("aerodynamic+EnvMimic", ("envmimic",), beside=AIR),
-    "delay": Method("vanilla+sysid+delay", (AIR, "--free", "delay"), seeded=False),
+    "delay": Method("vanilla+sysid+delay", DELAY, seeded=False),
     "delay-envmimic": Method("vanilla+sysid+delay+EnvMimic", ("envmimic",), beside="delay"),
     "air-alone": Method("aerodynamic, no delay or centre", _air_without("delay", "centre"), seeded=False),
 }
@@ -196,7 +201,10 @@ def replayed_policy(options: Options) -> Path:
 def simulator(kind: TrainedResidual, paths: list[Path], *, nominal: bool = False) -> OpenLoopEvaluator:
     """Return an evaluator on recordings for a kind of residual, with its own actuators or with `nominal` ones."""
     plain = Simulator(load_robot(), None if nominal else kind.actuators)
-    motions = [reconstruct(read_recording(path, load_robot()), load_robot(), plain.mj_model) for path in paths]
+    motions = [
+        reconstruct(read_recording(path, load_robot()), load_robot(), plain.mj_model, drivetrain=plain.drivetrain)
+        for path in paths
+    ]
     return OpenLoopEvaluator(plain, motions, kind.model)
 
 
@@ -342,10 +350,9 @@ def parse() -> Options:
     parser.add_argument("--robot", type=int, default=dataset.ROBOT_SEED, help="seed of the virtual robot")
     parser.add_argument("--robot-family", choices=get_args(RobotFamily), default="default", help="family of this robot")
     parser.add_argument("--fresh", type=int, default=2026, help="seed of the larger test set")
-    parser.add_argument("--output", type=Path, default=Path("runs/fidelity"), help="folder of the runs")
     parser.add_argument("--quick", action="store_true", help="train for seconds; the numbers mean nothing")
     parser.add_argument("--results", type=Path, help="JSON file to write the tables to")
-    arguments = parser.parse_args()
+    arguments = _setup.parse(parser, Path("runs/fidelity"))
     needed = {*always, *arguments.methods, *(METHODS[name].beside for name in arguments.methods)}
     arguments.methods = [name for name in METHODS if name in needed]
     return Options(**vars(arguments))
@@ -357,6 +364,19 @@ def arguments_of(method: Method, recorded: Recorded, training: list[Path], quick
     for use, paths in (("recordings", training), ("validation", recorded.validation), ("test", recorded.test)):
         arguments += [f"--{use}", *map(str, paths)]
     return [*arguments, "--actuators", "nominal" if method.nominal else str(recorded.actuators)]
+
+
+def without_known_delay(methods: Sequence[str], actuators: Path) -> list[str]:
+    """Return the methods that have a parameter to identify in a simulator with the actuators of this file.
+
+    If the actuators have a delay, it is known. The methods that identify the delay alone, and those whose residual acts
+    beside theirs, are then left out.
+    """
+    robot = load_robot()
+    if not has_delay(Simulator(robot, read_actuators(robot, actuators)[1])):
+        return list(methods)
+    alone = {name for name in methods if METHODS[name].arguments == DELAY}
+    return [name for name in methods if name not in alone and METHODS[name].beside not in alone]
 
 
 def learn(
@@ -383,7 +403,10 @@ def learn(
 def main() -> None:
     options = parse()
     recorded = record(options.hardware, options.output)
-    folders = learn(options.methods, options.seeds, options.output, recorded, quick=options.quick)
+    methods = without_known_delay(options.methods, recorded.actuators)
+    if left_out := [METHODS[name].label for name in options.methods if name not in methods]:
+        print(f"Left out, because the actuators in {recorded.actuators} have a delay: {', '.join(left_out)}.")
+    folders = learn(methods, options.seeds, options.output, recorded, quick=options.quick)
     effort = {
         METHODS[name].label: Cell(tuple(simulated(folder) / 1e3 for folder in members), ",.0f", spread=False)
         for name, members in folders.items()

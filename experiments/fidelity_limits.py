@@ -3,7 +3,8 @@
 #
 # Every error of a simulator includes the error of its starting state. Motion capture measures positions to about half a
 # millimetre, and reconstruction gives states to about a millimetre and a degree. Here, the virtual robot itself starts
-# from reconstructed states, one second apart, with the commands and the draught of the recording. Its error over 5 s is
+# from reconstructed states, one second apart, with the commands and the draught of the recording. The angles of its
+# motors are not recorded. They follow from the commands, after the robot's latency and backlash. Its error over 5 s is
 # a lower limit for all simulators. Then one property at a time is changed to that of the training simulators: still
 # air, long physics steps, or no joint friction. The increase of the error is the cost of this simplification.
 #
@@ -28,6 +29,7 @@ import _setup
 _setup.prepare()
 
 import deflation
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jaxtyping import Float
@@ -125,7 +127,10 @@ def errors(virtual: VirtualRobot, job: dataset.Job) -> tuple[str, Float[np.ndarr
     trial = virtual_robot.draw_trial(job.trial)
     with tempfile.TemporaryDirectory() as folder:
         recorded = deflation.recorded(job, virtual, job.trial, Path(folder))
-    motion = reconstruct(recorded, load_robot(), load_model(virtual.actuators))
+    own = dataclasses.replace(
+        virtual.actuators, delay=jnp.full(2, virtual.latency), backlash=jnp.asarray(virtual.backlash)
+    )
+    motion = reconstruct(recorded, load_robot(), load_model(own), drivetrain=own.drivetrain())
     steps, interval = (round(s / CONTROL_TIMESTEP) for s in (HORIZON, START_INTERVAL))
     starts = range(2, len(job.commands) - steps + 1, interval)
     nominal = load_model()
@@ -175,10 +180,9 @@ def main() -> None:
     )
     parser.add_argument("--robot", type=int, default=dataset.ROBOT_SEED, help="seed of the virtual robot")
     parser.add_argument("--fresh", type=int, default=2026, help="seed of the test set, as in fidelity.py (2026)")
-    parser.add_argument("--output", type=Path, default=Path("runs/fidelity-limits"), help="folder of the table")
     parser.add_argument("--quick", action="store_true", help="use two recordings; the numbers mean little")
     parser.add_argument("--results", type=Path, help="JSON file to write the table to")
-    options = parser.parse_args()
+    options = _setup.parse(parser, Path("runs/fidelity-limits"))
 
     virtual = virtual_robot.draw_robot(options.robot)
     jobs = dataset.fresh_jobs(options.fresh, 1 if options.quick else 6)

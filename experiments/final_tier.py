@@ -449,17 +449,16 @@ def write_tables(drawn: Mapping[str, Any], units: Path, output: Path) -> list[Pa
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=Path, help="file of draw_final.py")
-    parser.add_argument("--output", type=Path, help="folder of all stages (runs/final, or runs/final-quick)")
     numbers = range(len(ROBOTS))
     parser.add_argument("--robots", type=int, nargs="+", choices=numbers, default=list(numbers), help="robots (all)")
     parser.add_argument("--kinds", nargs="+", choices=KINDS, default=list(KINDS), help="kinds of units (all)")
     parser.add_argument("--list", action="store_true", help="list the units, and run nothing")
     parser.add_argument("--tables", action="store_true", help="write the tables of complete kinds, and run nothing")
     parser.add_argument("--quick", action="store_true", help="one robot, for minutes; the numbers mean nothing")
-    given = parser.parse_args()
+    given = _setup.parse(parser, Path("runs/final"))
     if given.quick == (given.seeds is not None):
         parser.error("give either --seeds or --quick")
-    output = given.output or Path("runs") / ("final-quick" if given.quick else "final")
+    output = given.output
     if given.quick:
         drawn = {"tag": "none", "commit": "none", "seeds": draw_seeds("none")}
         units, todo = output / "final", [Unit("fidelity", 0, None), Unit("walk", 0, 0)]

@@ -61,7 +61,10 @@ def reconstruct_split(split: Split, simulator: Simulator) -> dict[str, Motion]:
     """Return the reconstructed motions of a split of the bundled recordings, by name."""
     robot = simulator.robot
     recordings = [read_recording(path, robot) for path in list_bundled(split)]
-    return {recording.name: reconstruct(recording, robot, simulator.mj_model) for recording in recordings}
+    return {
+        recording.name: reconstruct(recording, robot, simulator.mj_model, drivetrain=simulator.drivetrain)
+        for recording in recordings
+    }
 
 
 def twin(job: dataset.Job) -> Motion:

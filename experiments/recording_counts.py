@@ -121,10 +121,9 @@ def main() -> None:
         "--counts", type=int, nargs="+", default=[1, 2, 4, 6, 14], help="numbers of recordings (1 2 4 6 14)"
     )
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="training seeds (0 1 2)")
-    parser.add_argument("--output", type=Path, default=Path("runs/recording_counts"), help="folder of the runs")
     parser.add_argument("--quick", action="store_true", help="learn for seconds; the numbers mean nothing")
     parser.add_argument("--results", type=Path, help="JSON file to write the table to")
-    arguments = parser.parse_args()
+    arguments = _setup.parse(parser, Path("runs/recording_counts"))
     if arguments.quick:
         arguments.counts, arguments.seeds = arguments.counts[:2], arguments.seeds[:1]
     found = learn(arguments)

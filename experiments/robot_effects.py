@@ -155,11 +155,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description="Measure policies on virtual robots without each of their effects, and with each of them alone."
     )
-    parser.add_argument(
-        "--output",
-        type=Path,
-        help=f"folder of `train all` ({transfer_tables.OUTPUT}, or {transfer_tables.QUICK_OUTPUT} under --quick)",
-    )
     parser.add_argument("--robot-seed", type=int, default=0, help="seed of the virtual robot in `train all` (0)")
     parser.add_argument(
         "--robot-family", choices=["default", "paper"], default="default", help="family of the virtual robot (default)"
@@ -175,9 +170,9 @@ def main() -> None:
     parser.add_argument("--trials", type=int, default=3, help="trials of each policy on each robot (3)")
     parser.add_argument("--quick", action="store_true", help="train for seconds, one trial; the numbers mean nothing")
     parser.add_argument("--results", type=Path, help="JSON file to write the table to")
-    arguments = parser.parse_args()
+    arguments = _setup.parse(parser, transfer_tables.OUTPUT)
     quick = arguments.quick
-    output = arguments.output or (transfer_tables.QUICK_OUTPUT if quick else transfer_tables.OUTPUT)
+    output = arguments.output
     options = pipeline.Options(
         output=output, robot_seed=arguments.robot_seed, robot_family=arguments.robot_family, quick=quick
     )

@@ -53,8 +53,8 @@ from ballu_mjx.recordings.csv_format import read_recording
 from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.viz.style import colour_of, label_of
 
-OUTPUT, QUICK_OUTPUT = Path("runs/all"), Path("runs/all-quick")
-"""Folders of the stages. `--quick` has its own folder, so that it does not replace trainings of hours."""
+OUTPUT = Path("runs/all")
+"""Folder of the stages of `train all`."""
 _SEED_STYLES = ("-", "--", ":", "-.")
 _SMALLEST_EXTENT = 0.4
 """Smallest width and height (m) of a panel."""
@@ -197,9 +197,6 @@ def main() -> None:
     parser.add_argument(
         "--robot-family", choices=["default", "paper"], default="default", help="family of the virtual robot (default)"
     )
-    parser.add_argument(
-        "--output", type=Path, help=f"folder of `train all`'s stages ({OUTPUT}, or {QUICK_OUTPUT} under --quick)"
-    )
     parser.add_argument("--rounds", type=int, default=1, help="rounds of EnvMimic; see `train all --help` (1)")
     parser.add_argument(
         "--also",
@@ -211,8 +208,8 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="train for seconds; the numbers mean nothing")
     parser.add_argument("--figure-only", action="store_true", help="draw finished trials; run nothing")
     parser.add_argument("--results", type=Path, help="JSON file to write the table to")
-    given = parser.parse_args()
-    output = given.output or (QUICK_OUTPUT if given.quick else OUTPUT)
+    given = _setup.parse(parser, OUTPUT)
+    output = given.output
     written = []
     if not given.figure_only:
         pipeline.run(

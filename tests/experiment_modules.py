@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import importlib.util
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
@@ -25,5 +26,6 @@ def experiment_module(script: Path) -> Iterator[ModuleType]:
     module = importlib.util.module_from_spec(spec)
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(EXPERIMENTS))
+        patch.setitem(sys.modules, script.stem, module)  # dataclasses look up their module there
         spec.loader.exec_module(module)
         yield module

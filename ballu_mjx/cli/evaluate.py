@@ -40,7 +40,8 @@ class Options(runtime.CommandOptions):
     """Also print the errors that motion-capture noise in the starting states causes. No simulator can be expected to
     have much smaller errors."""
     capture_noise: tuple[float, float] = (0.5, 0.3)
-    """Noise of the motion capture for --noise-floor: standard deviations of a position (mm) and of an angle (deg)."""
+    """Noise of the motion capture for --noise-floor: standard deviations of a position (mm) and of an angle (deg).
+    Joints that slide have the noise of a position."""
     output: Path | None = None
     """Folder for evaluation.txt, evaluation.json, tracking.png and replay.npz, for example the run's folder. Without
     this option: the table is only printed."""
@@ -110,7 +111,8 @@ def _evaluate(options: Options) -> None:
         noise = ReconstructionParameters(
             position_noise=distance / 1000, rotation_noise=math.radians(angle), joint_noise=math.radians(angle)
         )
-        shaken = [add_capture_noise(recording, noise, number) for number, recording in enumerate(recordings)]
+        model = simulator.mj_model
+        shaken = [add_capture_noise(recording, model, noise, number) for number, recording in enumerate(recordings)]
         floor = evaluator.of_starts([restore(each) for each in shaken], loaded.params)
         print(f"\nErrors that capture noise of {distance:g} mm and {angle:g} deg in the starting states alone causes,")
         print(f"and the errors above (independent errors add in squares):\n{noise_floor(floor, result.residual)}")

@@ -96,11 +96,6 @@ def choose_horizons(declared: Sequence[float], longest: float) -> tuple[float, .
     return HORIZONS if longest > HORIZONS[0] else _SHORT_HORIZONS
 
 
-def shortest_recording(declared: Sequence[float]) -> float:
-    """Return the least length (s) of a validation or test recording, given the horizons that the robot declares."""
-    return (max(declared) if declared else min(SCORE_HORIZONS)) + 0.5
-
-
 def has_diverged(error: float) -> bool:
     """Return whether an error (m or deg) is not finite, or `LARGEST` or more."""
     return not abs(error) < LARGEST

@@ -21,8 +21,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from mujoco import mjx
 
+from ballu_mjx.common.errors import InputError
 from ballu_mjx.evaluation.errors import (
     LARGEST,
+    SCORE_HORIZONS,
     Errors,
     Evaluation,
     base_name,
@@ -51,6 +53,16 @@ _RUNS = {True: (8, 64), False: (1024,)}
 smallest size that holds all of them, or split into batches of the largest one. Each size compiles its own program."""
 _CHUNK = 100
 """Control steps that the compiled program simulates at once. One program then serves recordings of all lengths."""
+
+
+def shortest_recording(robot: RobotDescription) -> float:
+    """Return the least length (s) of a validation or test recording.
+
+    It contains the longest horizon that the robot declares, or the shortest one of the default score. Half a second is
+    added, or the control steps before the first start and one more if these take longer.
+    """
+    horizon = max(robot.horizons) if robot.horizons else min(SCORE_HORIZONS)
+    return horizon + max(0.5, HISTORY * robot.control_timestep)
 
 
 class Replay(NamedTuple):
@@ -150,7 +162,10 @@ class OpenLoopEvaluator:
     """
 
     def __init__(self, simulator: Simulator, motions: Sequence[Motion], residual: Residual) -> None:
-        """Prepare to replay `motions` in `simulator`, without and with `residual`."""
+        """Prepare to replay `motions` in `simulator`, without and with `residual`.
+
+        **Raises** `InputError` for a motion that is too short for a replay.
+        """
         self.base, self.name = base_name(simulator.actuators is not None), residual.name
         self._residual = residual
         self._simulator = simulator
@@ -167,14 +182,20 @@ class OpenLoopEvaluator:
 
     def _look_at(self, motions: Sequence[Motion]) -> None:
         self.motions = tuple(motions)
+        longest = max(len(motion.command) for motion in self.motions) * self.robot.control_timestep
+        self.horizons = choose_horizons(self.robot.horizons, longest)
+        interval = round(min(START_INTERVAL, *self.horizons) / self.robot.control_timestep)
+        for motion in self.motions:
+            if len(motion.command) < HISTORY - 1 + interval:
+                raise InputError(
+                    f"{motion.name}: has {len(motion.command)} control steps, which are too few for a replay; give a "
+                    f"recording with {HISTORY - 1 + interval} or more."
+                )
         reference, com = stack_motions(self._simulator, motions)
         self._recorded, self._recorded_com = np.asarray(reference.features), np.asarray(com)
         self._reference = jax.device_get(pad_to_bucket(reference))
         own = self._simulator.model, self._simulator.drivetrain
         self._fixed = jax.device_put((*jax.device_get(own), self._reference), self._everywhere)
-        longest = max(len(motion.command) for motion in self.motions) * self.robot.control_timestep
-        self.horizons = choose_horizons(self.robot.horizons, longest)
-        interval = round(min(START_INTERVAL, *self.horizons) / self.robot.control_timestep)
         model = self._simulator.mj_model
         self._hinges = [measured_hinges(self.robot, model, motion) for motion in self.motions]
         names = dict.fromkeys(name for hinges in self._hinges for name in hinges)

@@ -73,6 +73,8 @@ SIGNED_AIR_PARAMETERS = ("lift", "centre")
 """Parameters that may be negative."""
 _LARGEST = 100.0
 """Largest magnitude of a parameter other than the delay (SI units), far above all realistic values."""
+_SINGLE_PRECISION = 1e-6
+"""Relative tolerance of the largest magnitudes, because numbers in files are rounded to single precision."""
 
 
 def longest_delay(robot: RobotDescription) -> float:
@@ -183,7 +185,7 @@ def air_parameters_from_json(values: Mapping[str, Any], path: Path, robot: Robot
         if name not in SIGNED_AIR_PARAMETERS and min(numbers) < 0:
             raise InputError(f"{path}: {name} is {value}; it must be 0 or more.")
         largest = longest_delay(robot) if name == "delay" else _LARGEST
-        if max(map(abs, numbers)) > largest:
+        if max(map(abs, numbers)) > largest * (1 + _SINGLE_PRECISION):
             raise InputError(f"{path}: {name} is {value}; its magnitude must be {largest:g} or less.")
         read[name] = jnp.asarray(numbers, jnp.float32).reshape(like.shape)
     return AirParameters(**read)

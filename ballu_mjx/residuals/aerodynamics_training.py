@@ -57,10 +57,11 @@ def fit_aerodynamics(
     """
     config = config or AirConfig()
     check_air_config(config, simulator.control_timestep)
-    if has_delay(simulator):
-        free = [name for name in free if name != "delay"]
+    known = ("delay",) if has_delay(simulator) else ()
+    free = [name for name in free if name not in known]
     if not free:
-        raise InputError(f"--free names no parameter that is unknown; give one or more of {', '.join(AIR_PARAMETERS)}.")
+        unknown = [name for name in AIR_PARAMETERS if name not in known]
+        raise InputError(f"--free names no parameter that is unknown; give one or more of {', '.join(unknown)}.")
     if fixed_from is not None and not same_parameters(fixed_from.actuators, simulator.actuators):
         raise InputError(
             "The earlier residual was fitted with other actuators than the simulator's; give the same actuators."

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence, Set
 from pathlib import Path
 
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.evaluation.errors import shortest_recording
+from ballu_mjx.evaluation.open_loop import shortest_recording
 from ballu_mjx.identification.actuators import AUTO, NOMINAL, find_actuators, read_actuators
 from ballu_mjx.recordings.csv_format import list_recordings, read_recording
 from ballu_mjx.recordings.load import bundled_recordings
@@ -258,7 +258,7 @@ def check_recording(path: Path, recording: Recording, robot: RobotDescription, *
             f"{path}: is a {recording.kind} recording; residuals need free recordings, which contain the pose of "
             f"{robot.tracked}. Leave it out."
         )
-    shortest = shortest_recording(robot.horizons)
+    shortest = shortest_recording(robot)
     duration = recording.time[-1] - recording.time[0]
     if long_enough and duration < shortest:
         raise InputError(

@@ -194,10 +194,10 @@ class EnvMimicEnv(Env):
         self.reference = pad_to_bucket(reference)
         self.episode_length = round(config.episode_seconds / self.robot.control_timestep)
         self.recorded_inputs = recorded_inputs(reference, config, self.robot)
-        self.observed = TrainingRange.of(self.recorded_inputs)
+        self.mirror = network_mirror(self.config, self.robot)
+        self.observed = TrainingRange.of(self.recorded_inputs, self.mirror)
         self._spread = jnp.std(self.recorded_inputs, axis=0)
         self.initial_action = jnp.asarray(expected_units(self.config, self.robot), jnp.float32)
-        self.mirror = network_mirror(self.config, self.robot)
         shapes = jax.eval_shape(self.reset, jax.random.key(0)).obs
         self._observation_size = {name: shape.shape for name, shape in shapes.items()}
 

@@ -304,29 +304,49 @@ class _Search:
         )
 
     def _evaluation(self, windows: _Windows) -> Evaluate:
-        """Return the function that the solver calls, which computes rows of the least-squares problem and Jacobians.
+        """Return the function that the solver calls."""
+        own = self._parametrization
+        return robust_least_squares(
+            lambda vector: windows.errors(own.parameters(vector)),
+            lambda vector: windows.derivatives(own.parameters(vector), own.directions(vector)),
+        )
 
-        The rows are weighted errors, then the prior. The Jacobian takes most of the time. It is 0 at points that do not
-        decrease the loss: the solver rejects them without using it.
-        """
-        lowest = math.inf
 
-        def evaluate(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            nonlocal lowest
-            (vector,) = points
-            params = self._parametrization.parameters(vector)
-            errors = windows.errors(params)
-            # Iteratively reweighted least squares: the derivatives take the weight of a window as constant.
-            weight = (1 + np.sum(errors**2, axis=1)[:, None] / OUTLIER_THRESHOLD**2) ** -0.25
-            values = np.concatenate([(weight * errors).ravel(), vector])
-            loss, size = float(np.sum(values**2)), len(vector)
-            if loss >= lowest:
-                return values[None], np.zeros((1, len(values), size))
-            lowest = loss
-            jacobian = weight[..., None] * windows.derivatives(params, self._parametrization.directions(vector))
-            return values[None], np.concatenate([jacobian.reshape(-1, size), np.eye(size)])[None]
+def robust_least_squares(
+    errors: Callable[[Float[np.ndarray, " size"]], Float[np.ndarray, "windows entries"]],
+    derivatives: Callable[[Float[np.ndarray, " size"]], Float[np.ndarray, "windows entries size"]],
+) -> Evaluate:
+    """Return the function that a solver calls, which computes rows of the least-squares problem and their Jacobian.
 
-        return evaluate
+    The rows are scaled errors of windows, then the prior. Their sum of squares is the robust loss of all windows
+    (`window_errors.pseudo_huber`) plus that of the prior. The Jacobian is scaled so that its product with the rows is
+    the gradient of half of it. It takes most of the time, and is 0 at points that the solver certainly rejects.
+
+    **Arguments**
+
+    - `errors`: errors of the windows at a point.
+    - `derivatives`: their derivatives.
+    """
+    bound = lowest = math.inf  # The loss at the solver's point is at most `bound`. `lowest` is the lowest loss so far.
+
+    def evaluate(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        nonlocal bound, lowest
+        (vector,) = points
+        found, size = errors(vector), len(vector)
+        root = np.sqrt(1 + np.sum(found**2, axis=1, keepdims=True) / OUTLIER_THRESHOLD**2)
+        factor = np.sqrt(2 / (1 + root))  # The loss divided by the squared norm is 2 / (1 + root), also at 0.
+        values = np.concatenate([(factor * found).ravel(), vector])
+        loss = float(np.sum(values**2))
+        if loss >= bound:
+            return values[None], np.zeros((1, len(values), size))
+        # The solver rejects a decrease that is small relative to the predicted one. It predicts at most the whole loss.
+        if lowest == math.inf or loss < lowest - _ACCEPTED * bound:
+            bound = loss
+        lowest = min(lowest, loss)
+        jacobian = derivatives(vector) / (root * factor)[..., None]
+        return values[None], np.concatenate([jacobian.reshape(-1, size), np.eye(size)])[None]
+
+    return evaluate
 
 
 def _priors(windows: _Windows, spread: float) -> Float[np.ndarray, "terms 6"]:
@@ -347,6 +367,8 @@ _PATIENCE = 8
 """Iterations without gain after which a stage ends. An iteration that only shortens the next step has no gain."""
 _SMALL_GAIN = 5e-3
 """Relative decrease of the loss below which a stage ends, if it is not 0."""
+_ACCEPTED = 0.01
+"""Fraction of the predicted decrease from which the solver accepts a step (Optimistix, `ClassicalTrustRegion`)."""
 _BATCH = 1024
 """Largest number of windows that are simulated in parallel."""
 _SMALLEST_TERM = 1e-3

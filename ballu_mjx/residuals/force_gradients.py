@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.motion_windows import MotionWindows, check_motion_windows, start_motion_window
@@ -135,6 +135,10 @@ def train(
     - `report`: function that is called every `config.validate_every` gradient steps.
     - `linearize`: linearization of the simulator to correct, including its base residual, for the force set of
       `forces`. Derivatives with respect to joint torques are ignored.
+
+    Windows that diverge are left out of the gradient steps and of the loss.
+
+    **Raises** `InputError` if all windows of a simulation diverge.
     """
     simulate = compile_rollout(linearize.simulator, forces)
     optimizer = optax.chain(optax.clip_by_global_norm(config.max_grad_norm), optax.adam(config.learning_rate))
@@ -149,9 +153,18 @@ def train(
         drawn = np.asarray(jax.random.permutation(own, len(recorded.qpos)))[: config.windows]
         taken = jax.tree.map(lambda x, drawn=drawn: np.asarray(x)[drawn], recorded)
         steps, features = simulate(wrap(jax.device_get(carry[0])), taken)
+        losses = np.asarray(jax.vmap(functools.partial(_loss, robot=plain.robot))(features, taken.features))
         data = _in_windows(linearize(steps), steps.loads, taken)
         simulated += len(steps.loads) * (2 + linearize.directions)
-        loss = float(np.mean(jax.vmap(functools.partial(_loss, robot=plain.robot))(features, taken.features)))
+        finite = np.flatnonzero(np.isfinite(losses) & _are_finite(data))
+        if not len(finite):
+            raise InputError(
+                f"All {len(losses)} windows of the training recordings diverge in simulation after {done} gradient "
+                "steps; give a smaller --learning-rate or --window-seconds."
+            )
+        rows = np.resize(finite, len(losses))  # Others replace diverged windows: a compiled program has a fixed size.
+        data = jax.tree.map(lambda x, rows=rows: x[rows], data)
+        loss = float(np.mean(losses[finite]))
         for first in range(0, config.updates, config.validate_every):
             key, own = jax.random.split(key)
             count = min(config.validate_every, config.updates - first)
@@ -169,6 +182,12 @@ def _in_windows(
     linearized = linearized._replace(state=linearized.state[..., :inputs], seen=linearized.seen[..., :inputs])
     parts = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32).reshape(*shape, *x.shape[1:]), (linearized, loads))
     return *parts, jax.tree.map(jnp.asarray, recorded)
+
+
+def _are_finite(data: Any) -> Bool[np.ndarray, " windows"]:
+    """Return for each window whether all its numbers are finite. Windows are the first axis of all arrays."""
+    parts = [np.isfinite(np.asarray(x)).reshape(len(x), -1).all(axis=1) for x in jax.tree.leaves(data)]
+    return np.all(parts, axis=0)
 
 
 def _loss(

@@ -183,7 +183,7 @@ class ForceLabeller:
         (count, after, every), loads = state.shape, self._linearize.loads
         force = np.arange(after, after + loads)
         known = np.any(state, axis=(1, 2), keepdims=True)[:, 0]  # The linearizer returns zeros without derivatives.
-        weight = known / self._process**2
+        weight, defect = known / self._process**2, np.where(known, defect, 0.0)  # A diverged step has a defect of NaN.
         spread = np.r_[
             self._measured,
             np.full(self._model.nv, _ANY_VELOCITY),

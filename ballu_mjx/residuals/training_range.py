@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError, is_number
+from ballu_mjx.rl.mirror import Mirror
 from ballu_mjx.runs.record import TrainingRecord
 from ballu_mjx.sim.residual import Action, Commands, Fields, History, Residual
 
@@ -33,9 +34,15 @@ class TrainingRange(NamedTuple):
     high: Float[np.ndarray | Array, ...]
 
     @staticmethod
-    def of(inputs: Float[Array | np.ndarray, "states inputs"]) -> TrainingRange:
-        """Return the range of inputs."""
+    def of(inputs: Float[Array | np.ndarray, "states inputs"], mirror: Mirror | None = None) -> TrainingRange:
+        """Return the range of inputs.
+
+        With `mirror`, the range includes the mirror images of the inputs, because a symmetric network learns their
+        loads, too.
+        """
         seen = np.asarray(inputs, np.float32)
+        if mirror is not None:
+            seen = np.concatenate([seen, np.asarray(mirror.observation(seen))])
         return TrainingRange(seen.min(axis=0), seen.max(axis=0))
 
     @staticmethod

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
+import _setup
 import numpy as np
 
 from ballu_mjx.common.results import Cell, Table
@@ -15,13 +16,12 @@ from ballu_mjx.identification.fit_robot import RobotFit
 
 
 def parse(description: str, output: Path) -> argparse.Namespace:
-    """Parse the command line, and return its options `data`, `output` (its default is given), `quick` and `results`."""
+    """Parse the command line, and return its options `data`, `output` (see `_setup.parse`), `quick` and `results`."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--data", type=Path, required=True, help="folder of the recordings")
-    parser.add_argument("--output", type=Path, default=output, help=f"folder for the tables ({output})")
     parser.add_argument("--quick", action="store_true", help="short trial run; the numbers mean little")
     parser.add_argument("--results", type=Path, help="JSON file to write the tables to")
-    return parser.parse_args()
+    return _setup.parse(parser, output)
 
 
 def report(stage: str, iteration: int, steps: int, value: float) -> None:

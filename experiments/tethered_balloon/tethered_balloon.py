@@ -259,10 +259,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description="Learn residuals for a tethered balloon in wind.")
     parser.add_argument("--methods", nargs="*", choices=METHODS, default=["envmimic"], help="methods (envmimic)")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="training seeds (0 1 2)")
-    parser.add_argument("--output", type=Path, default=Path("runs/tethered-balloon"), help="folder of all results")
     parser.add_argument("--quick", action="store_true", help="train one seed for seconds; the numbers mean little")
     parser.add_argument("--results", type=Path, help="JSON file to write the tables to")
-    options = parser.parse_args(arguments)
+    options = _setup.parse(parser, Path("runs/tethered-balloon"), arguments)
 
     description = read_description(DESCRIPTION)
     recordings = options.output / "recordings"

@@ -16,6 +16,7 @@ from ballu_mjx.ballu.actuators_file import actuators_to_json, read_actuators, wr
 from ballu_mjx.ballu.model import load_model, standing_qpos
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.evaluation.open_loop import nominal_model
+from ballu_mjx.residuals.aerodynamics import AIR_PARAMETERS
 from ballu_mjx.residuals.aerodynamics_training import fit_aerodynamics
 from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.drivetrain import drivetrain_of
@@ -116,5 +117,6 @@ def test_nominal_model_has_the_constraint_rows_of_the_identified_model() -> None
 
 
 def test_aerodynamic_fit_refuses_to_fit_the_delay_of_identified_actuators() -> None:
-    with pytest.raises(InputError, match="no parameter that is unknown"):
+    others = [name for name in AIR_PARAMETERS if name != "delay"]
+    with pytest.raises(InputError, match=f"no parameter that is unknown; give one or more of {', '.join(others)}\\."):
         fit_aerodynamics(Simulator(load_robot(), FOUND), [], free=("delay",))

@@ -106,7 +106,7 @@ def test_added_noise_changes_states_as_much_as_measurement_noise(truth: Truth):
     """
     recording = capture(truth)
     once = reconstruct(recording, load_robot(), MODEL).qpos
-    again = [reconstruct(add_capture_noise(recording, seed=seed), load_robot(), MODEL).qpos for seed in (1, 2)]
+    again = [reconstruct(add_capture_noise(recording, MODEL, seed=seed), load_robot(), MODEL).qpos for seed in (1, 2)]
     error = once[2:-2] - truth.qpos[::5][: len(once)][2:-2]
     for noisy in again:
         columns = [*range(3), *HIPS]  # coordinates that joint stops do not clip

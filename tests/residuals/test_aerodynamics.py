@@ -22,6 +22,7 @@ from ballu_mjx.residuals.aerodynamics import (
     Aerodynamics,
     AirParameters,
     air_parameters_to_json,
+    longest_delay,
     read_air_parameters,
 )
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, AirFit, Optimum, air_scales, at_whole_delay, identify_air
@@ -255,6 +256,20 @@ def test_parameters_are_read_back_from_their_file(tmp_path: Path):
     read = read_air_parameters(path, load_robot())
     for name in AIR_PARAMETERS:
         np.testing.assert_allclose(getattr(read, name), getattr(AIR, name), rtol=1e-6)
+
+
+@pytest.mark.parametrize("timestep", [0.05, 0.03333333333])
+def test_the_longest_delay_is_read_back_despite_its_rounding(tmp_path: Path, timestep: float):
+    """In single precision, two control steps of 0.0333... s are longer than in double precision."""
+    robot = dataclasses.replace(load_robot(), control_timestep=timestep)
+    path, air = tmp_path / AERODYNAMICS_FILE, dataclasses.replace(AIR, delay=jnp.float32(longest_delay(robot)))
+    content = {"format": AERODYNAMICS_FORMAT, "parameters": air_parameters_to_json(air)}
+    path.write_text(json.dumps(content))
+    assert float(read_air_parameters(path, robot).delay) == pytest.approx(2 * timestep)
+    content["parameters"]["delay"] = 2.001 * timestep
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match="delay is .* must be .* or less"):
+        read_air_parameters(path, robot)
 
 
 @pytest.mark.parametrize(

@@ -2,15 +2,31 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
+import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from ballu_mjx.common.errors import InputError
+from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording
-from ballu_mjx.residuals.dataset import USES, RecordingsData, ResidualDataset, check_overlap, replay_title
+from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.recordings.recording import cut
+from ballu_mjx.residuals.aerodynamics import Aerodynamics
+from ballu_mjx.residuals.dataset import (
+    USES,
+    RecordingsData,
+    ResidualDataset,
+    check_overlap,
+    check_recording,
+    replay_title,
+)
 from ballu_mjx.robots.registry import load_robot
+from ballu_mjx.sim.observation import HISTORY
+from ballu_mjx.sim.simulator import Simulator
 
 ONE, TWO, THREE, FOUR = list_bundled("training")[:2] + list_bundled("test")[:2]
 
@@ -55,6 +71,37 @@ def test_two_uses_that_share_only_some_recordings_are_refused(one: str, other: s
         check_overlap(files)
     files[other] = files[one]
     check_overlap(files)
+
+
+@pytest.mark.parametrize(("timestep", "shortest"), [(0.05, 5.5), (0.4, 6.2)])
+def test_recordings_contain_the_longest_horizon_after_the_first_start(timestep: float, shortest: float) -> None:
+    """A start needs a history, which takes longer than half a second if control steps are long."""
+    robot = dataclasses.replace(load_robot(), control_timestep=timestep, horizons=(5.0,))
+    whole = read_recording(THREE, robot)
+    for duration, accepted in ((shortest + 0.05, True), (shortest - 0.05, False)):
+        short = cut(whole, slice(int(np.searchsorted(whole.time, whole.time[0] + duration))))
+        steps = math.floor((short.time[-1] - short.time[0]) / timestep)
+        if accepted:
+            check_recording(THREE, short, robot, long_enough=True)
+            assert steps - (HISTORY - 1) >= round(5.0 / timestep)
+        else:
+            with pytest.raises(InputError, match=f"validation and test need {shortest:g} s or more"):
+                check_recording(THREE, short, robot, long_enough=True)
+
+
+def test_a_motion_without_a_start_is_refused() -> None:
+    model = load_robot().load_model()
+    steps = HISTORY + 10  # less than the second between two starts
+    qpos, command = np.tile(model.qpos0, (steps + 1, 1)), np.zeros((steps, 2))
+    motion = Motion("blink", np.arange(steps + 1) * 0.05, command, qpos, np.zeros((steps + 1, model.nv)), {})
+    simulator = Simulator(load_robot())
+    long = dataclasses.replace(
+        motion, name="long", time=np.arange(41) * 0.05, command=np.zeros((40, 2)), qpos=np.tile(model.qpos0, (41, 1)),
+        qvel=np.zeros((41, model.nv)),
+    )  # fmt: skip
+    residual = Aerodynamics(load_robot(), simulator.mj_model)
+    with pytest.raises(InputError, match="blink: has 13 control steps.*give a recording with 22 or more"):
+        OpenLoopEvaluator(simulator, [long, motion], residual)
 
 
 def test_bundled_recordings_of_different_uses_do_not_overlap() -> None:

@@ -16,6 +16,7 @@ from scipy import optimize
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.recordings.window_errors import pseudo_huber
 from ballu_mjx.residuals.deploy.export import export_simulator, rollout_positions
 from ballu_mjx.residuals.fluid import (
     AXES,
@@ -27,7 +28,13 @@ from ballu_mjx.residuals.fluid import (
     symmetric_mask,
     terms_of,
 )
-from ballu_mjx.residuals.fluid_fit import FluidConfig, FluidFit, check_fluid_config, fit_fluid_forces
+from ballu_mjx.residuals.fluid_fit import (
+    FluidConfig,
+    FluidFit,
+    check_fluid_config,
+    fit_fluid_forces,
+    robust_least_squares,
+)
 from ballu_mjx.residuals.fluid_parametrization import PASSIVE_SETS, PassiveCoefficients
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.observation import HISTORY
@@ -132,6 +139,41 @@ def test_added_mass_has_no_weight(glider: RobotDescription):
         np.testing.assert_allclose(path[:, 2], path[0, 2], atol=1e-6)
         speeds.append(path[-1, 0] - path[-2, 0])
     assert speeds[1] == pytest.approx(speeds[0] / 2, rel=1e-3)
+
+
+def test_the_solver_sees_the_robust_loss_and_its_gradient():
+    rng = np.random.default_rng(0)
+    base, slope, bend = (rng.normal(size=(7, 5, *more)) for more in ((), (3,), (3,)))
+    norms = np.array([0.0, 1e-9, 0.1, 1.0, 5.0, 20.0, 100.0])[:, None]  # from 0 to far above the threshold
+
+    def errors(x: np.ndarray) -> np.ndarray:
+        return norms * (base + slope @ x + bend @ x**2)
+
+    def solve(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        evaluate = robust_least_squares(errors, lambda x: norms[..., None] * (slope + 2 * bend * x))
+        (values,), (jacobian,) = evaluate(x[None])
+        return values, jacobian
+
+    for point in (np.zeros(3), np.array([0.3, -0.2, 0.5])):
+        values, jacobian = solve(point)
+        loss = np.sum(pseudo_huber(np.sum(errors(point) ** 2, axis=1))) + point @ point
+        assert np.sum(values**2) == pytest.approx(loss)
+        sides = [[0.5 * np.sum(solve(x)[0] ** 2) for x in (point - h, point + h)] for h in 1e-6 * np.eye(3)]
+        numeric = [(after - before) / 2e-6 for before, after in sides]
+        np.testing.assert_allclose(jacobian.T @ values, numeric, rtol=1e-4)
+
+
+def test_every_point_that_the_solver_may_accept_has_a_jacobian():
+    """The solver rejects a decrease that is far smaller than it predicted. It may accept a still smaller one later."""
+    evaluate = robust_least_squares(lambda x: x[:, None], lambda x: np.ones((1, 1, 1)))
+
+    def has_jacobian(x: float) -> bool:
+        return bool(np.any(evaluate(np.array([[x]]))[1]))
+
+    assert [has_jacobian(x) for x in (2.0, 2.1, 1.995, 1.999, 1.0, 1.5, 0.9)] == [
+        *(True, False, True, True),
+        *(True, False, True),
+    ]
 
 
 def power(coefficients: np.ndarray, centre: np.ndarray, seed: int) -> np.ndarray:

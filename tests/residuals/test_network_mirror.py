@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -12,13 +14,17 @@ import numpy as np
 import pytest
 
 from ballu_mjx.common.errors import InputError
+from ballu_mjx.evaluation.open_loop import Evaluators
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import stack_motions
-from ballu_mjx.residuals.envmimic import EnvMimicConfig
+from ballu_mjx.residuals import force_gradients
+from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv
 from ballu_mjx.residuals.envmimic_training import check_resumes
+from ballu_mjx.residuals.force_gradients import AnalyticConfig
+from ballu_mjx.residuals.force_training import fit_analytic
 from ballu_mjx.residuals.network import NetworkResidual
 from ballu_mjx.residuals.network_config import ForceNetworkConfig
-from ballu_mjx.residuals.network_input import num_inputs
+from ballu_mjx.residuals.network_input import num_inputs, recorded_inputs
 from ballu_mjx.residuals.network_loads import num_loads
 from ballu_mjx.residuals.network_mirror import network_mirror
 from ballu_mjx.rl import ppo
@@ -27,11 +33,14 @@ from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.runs.checkpoints import Checkpoint
 from ballu_mjx.sim.force_sets import ForceSet
 from ballu_mjx.sim.observation import HISTORY
+from ballu_mjx.sim.residual import Residual
 from ballu_mjx.sim.simulator import Simulator
 
 BALLU = load_robot()
 NETWORK = ppo.PPOConfig(policy_layers=(16, 8))
 SIGNS = np.array([1.0, -1.0, 1.0])
+STATES = HISTORY + 3
+"""Number of states of a motion."""
 
 
 @pytest.fixture(scope="module")
@@ -58,15 +67,15 @@ def motion(simulator: Simulator) -> Motion:
     """A tumbling robot: nothing about it is symmetric."""
     rng = np.random.default_rng(0)
     model = simulator.mj_model
-    qpos = np.tile(model.key_qpos[0] if model.nkey else model.qpos0, (HISTORY + 1, 1))
-    qpos[:, :3] += rng.normal(size=(HISTORY + 1, 3))
-    qpos[:, 3:7] = rng.normal([1.0, 0.0, 0.0, 1.0], 0.3, (HISTORY + 1, 4))
+    qpos = np.tile(model.key_qpos[0] if model.nkey else model.qpos0, (STATES, 1))
+    qpos[:, :3] += rng.normal(size=(STATES, 3))
+    qpos[:, 3:7] = rng.normal([1.0, 0.0, 0.0, 1.0], 0.3, (STATES, 4))
     qpos[:, 3:7] /= np.linalg.norm(qpos[:, 3:7], axis=1, keepdims=True)
     qpos[:, 7:] += 0.2 * rng.normal(size=qpos[:, 7:].shape)
-    qvel = rng.normal(size=(HISTORY + 1, model.nv))
+    qvel = rng.normal(size=(STATES, model.nv))
     low, high = np.array(BALLU.command_ranges).T
-    command = rng.uniform(low, high, (HISTORY, len(BALLU.commands)))
-    return Motion("tumble", np.arange(HISTORY + 1) * BALLU.control_timestep, command, qpos, qvel, {})
+    command = rng.uniform(low, high, (STATES - 1, len(BALLU.commands)))
+    return Motion("tumble", np.arange(STATES) * BALLU.control_timestep, command, qpos, qvel, {})
 
 
 def loads(simulator: Simulator, motion: Motion, config: ForceNetworkConfig) -> Any:
@@ -79,7 +88,7 @@ def loads(simulator: Simulator, motion: Motion, config: ForceNetworkConfig) -> A
     policy["params"]["Dense_0"]["kernel"] = 100.0 * policy["params"]["Dense_0"]["kernel"]
     model = NetworkResidual(config, BALLU, ppo.make_inference(*sizes))
     reference, _ = stack_motions(simulator, [motion])
-    acts = model.act(params._replace(policy=policy), reference.features[0, :HISTORY], reference.command[0])
+    acts = model.act(params._replace(policy=policy), reference.features[0, :HISTORY], reference.command[0, :HISTORY])
     return jax.device_get(acts)
 
 
@@ -102,6 +111,34 @@ def test_a_mirrored_motion_has_the_mirrored_loads(
     else:
         assert np.ptp(one.command_change) > 1e-3
         np.testing.assert_allclose(other.command_change, one.command_change[::-1], atol=1e-5)
+
+
+class Scores(Evaluators):
+    """Evaluators that simulate nothing, and return the same score for all parameters."""
+
+    def of(self, residual: Residual, motions: Sequence[Motion]) -> Any:
+        return lambda params: SimpleNamespace(score=1.0)
+
+
+@pytest.mark.parametrize("method", ["envmimic", "analytic"])
+def test_mirrored_motions_are_in_the_training_range(
+    simulator: Simulator, motion: Motion, method: str, monkeypatch: pytest.MonkeyPatch
+):
+    """The loads of a symmetric network act on them, although its loads fade outside of the range."""
+    options = {"forces": "force", "force_scale": 0.05, "force_limit": 1.0, "expected_loads": (0.0,), "force_cost": 1.0}
+    config = EnvMimicConfig(**options, mirror=True, fade_width=0.5)  # pyright: ignore[reportArgumentType]
+    reference, _ = stack_motions(simulator, [mirrored(motion, simulator.mj_model)])
+    images = recorded_inputs(reference, config, BALLU)
+    if method == "envmimic":
+        observed = EnvMimicEnv(simulator, [motion], config).observed
+        alone = EnvMimicEnv(simulator, [motion], dataclasses.replace(config, mirror=False)).observed
+        assert all(alone.excess(image) > 0.5 for image in images)
+    else:
+        monkeypatch.setattr(force_gradients, "train", lambda *arguments: None)
+        seconds = 2 * BALLU.control_timestep
+        fit = AnalyticConfig(window_seconds=seconds, interval_seconds=seconds)
+        observed = fit_analytic(simulator, [motion], fit, forces=config, evaluators=Scores(simulator)).observed
+    assert all(observed.excess(image) == 0.0 for image in images)
 
 
 def test_mirror_images_that_cannot_be_are_refused():

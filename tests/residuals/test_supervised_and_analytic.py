@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +31,7 @@ from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.robots.registry import load_robot
-from ballu_mjx.sim.linearize import ControlSteps, Linearizer
+from ballu_mjx.sim.linearize import ControlSteps, Linearized, Linearizer
 from ballu_mjx.sim.observation import HISTORY
 from ballu_mjx.sim.simulator import Simulator
 from ballu_mjx.sim.step import count_substeps
@@ -226,6 +228,79 @@ def test_gradients_recover_a_known_force(
     # On legs, other forces and torques that vary between steps move the balloon almost as this force does.
     np.testing.assert_allclose(stepping[:2], PUSH[:2], atol=2 * CLOSE)
     assert metrics["loss"] < 0.05 * found[0][1]["loss"]  # last simulation against first
+
+
+class MadeUp(Linearizer):
+    """Linearizer that returns made-up states and derivatives, without simulation. The steps `diverged` diverge."""
+
+    def __init__(self, diverged: np.ndarray) -> None:
+        super().__init__(SIMULATOR, forces="wrench")
+        self.diverged = diverged
+
+    def __call__(self, steps: ControlSteps) -> Linearized:
+        count, states = len(steps.loads), 2 * MODEL.nv
+        rng = np.random.default_rng(0)
+        qpos, features = np.tile(standing_qpos(MODEL), (count, 1)), 0.01 * rng.normal(size=(count, 27))
+        qvel, state = np.zeros((count, MODEL.nv)), 0.1 * rng.normal(size=(count, states, self.directions))
+        seen = 0.1 * rng.normal(size=(count, 27, self.directions))
+        for after in (qpos, qvel, features):
+            after[self.diverged] = np.nan
+        for derivative in (state, seen):  # as a `Linearizer` does
+            derivative[self.diverged] = 0.0
+        return Linearized(qpos, qvel, features, state, seen)
+
+
+def learned_from(
+    windows: MotionWindows, start: ppo.Params, diverged: np.ndarray, patch: pytest.MonkeyPatch
+) -> tuple[Any, dict[str, float]]:
+    """Return the policy after some gradient steps on made-up simulations of windows, and the last metrics.
+
+    `diverged` are the windows that diverge.
+    """
+    linearize, steps = MadeUp(np.zeros(0, int)), windows.features.shape[1]
+
+    def rollout(params: Any, recorded: MotionWindows) -> tuple[Any, np.ndarray]:
+        drawn = [int(np.argmin(np.abs(windows.features - each).sum(axis=(1, 2)))) for each in recorded.features]
+        linearize.diverged = np.repeat(np.isin(drawn, diverged), steps)
+        features = np.where(np.isin(drawn, diverged)[:, None, None], np.nan, np.asarray(recorded.features) + 0.01)
+        return SimpleNamespace(loads=np.zeros((len(drawn) * steps, ACTIONS))), features
+
+    patch.setattr(force_gradients, "compile_rollout", lambda simulator, forces: rollout)
+    found: list[tuple[Any, dict[str, float]]] = []
+    force_gradients.train(
+        FORCES,
+        lambda policy: start._replace(policy=policy),
+        start.policy,
+        windows,
+        np.ones(INPUTS, np.float32),
+        AnalyticConfig(relinearizations=2, updates=3, validate_every=3, observation_noise=0.0),
+        lambda step, policy, metrics: found.append((policy, metrics)),
+        linearize,
+    )
+    return found[-1]
+
+
+def test_gradient_steps_leave_out_windows_that_diverge(
+    recorded: MotionWindows, start: ppo.Params, monkeypatch: pytest.MonkeyPatch
+):
+    few = jax.tree.map(lambda x: np.asarray(x)[:3], recorded)
+    policy, metrics = learned_from(few, start, np.array([1]), monkeypatch)
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(policy))
+    moved = jax.tree.map(lambda one, other: float(np.abs(one - other).max()), policy, jax.device_get(start.policy))
+    assert max(jax.tree.leaves(moved)) > 0
+    assert all(np.isfinite(value) for value in metrics.values())
+    with pytest.raises(InputError, match="All 3 windows .* diverge"):
+        learned_from(few, start, np.arange(3), monkeypatch)
+
+
+def test_a_step_that_diverges_leaves_the_other_labels_finite(motions: list[Motion]):
+    motion = motions[0]
+    labels = []
+    for diverged in ([], [20]):
+        label = force_regression.ForceLabeller(MadeUp(np.array(diverged, int)), SupervisedConfig(), WRENCH)
+        labels.append(label(motion))
+    assert np.all(np.isfinite(labels[1]))
+    assert 0 < np.abs(labels[1] - labels[0]).max() < np.abs(labels[0]).max()
 
 
 @pytest.mark.parametrize(

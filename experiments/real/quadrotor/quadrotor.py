@@ -352,9 +352,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--data", type=Path, required=True, help="folder with the public files")
     parser.add_argument("--methods", nargs="*", choices=METHODS, default=list(METHODS), help="methods (all)")
     parser.add_argument("--seed", type=int, default=0, help="training seed (0)")
-    parser.add_argument("--output", type=Path, default=Path("runs/quadrotor"), help="folder of results")
     parser.add_argument("--quick", action="store_true", help="few flights and steps; the numbers mean little")
-    options = parser.parse_args(arguments)
+    options = _setup.parse(parser, Path("runs/quadrotor"), arguments)
     robot = read_description(FOLDER / "quadrotor.robot.json")
     few = slice(0, 2) if options.quick else slice(None)
     motions = {

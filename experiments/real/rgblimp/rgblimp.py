@@ -401,12 +401,11 @@ def learn(files: Mapping[str, Sequence[Path]], run: Path, options: Sequence[str]
 def main() -> None:
     parser = argparse.ArgumentParser(description="Learn the air forces on a real blimp, and predict test flights.")
     parser.add_argument("--data", type=Path, required=True, help="folder with the public files or recordings of them")
-    parser.add_argument("--output", type=Path, default=Path("runs/rgblimp"), help="folder for results (runs/rgblimp)")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="seeds of EnvMimic (0 1 2)")
     parser.add_argument("--quick", action="store_true", help="few flights and steps; the numbers mean little")
     parser.add_argument("--results", type=Path, help="JSON file to write the tables to")
     parser.add_argument("--figure", type=Path, help="PNG file for a figure of three test flights")
-    options = parser.parse_args()
+    options = _setup.parse(parser, Path("runs/rgblimp"))
     robot = read_description(DESCRIPTION)
     few = slice(0, 2) if options.quick else slice(None)
     files = {
