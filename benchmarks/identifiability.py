@@ -73,14 +73,15 @@ def simulate(identifier: Identifier, vectors: np.ndarray) -> Sweep:
 
 def blank() -> Sweep:
     """Return a sweep of the right sizes without measurements."""
-    times = LEVELS * TIMES
+    times, command = LEVELS * TIMES, np.repeat(np.linspace(0, 1, LEVELS)[:, None], len(SIDES), axis=1)
     return Sweep(
         robot="model",
-        command=np.repeat(np.linspace(0, 1, LEVELS)[:, None], len(SIDES), axis=1),
+        command=command,
         settled=np.zeros((LEVELS, 2, 2)),
         drift=np.zeros((LEVELS, 2, 2)),
         samples=np.full(LEVELS, SAMPLES),
         motion=np.zeros((times, 2, 2)),
+        commanded=np.repeat(command, TIMES, axis=0),
         hold=np.repeat(np.arange(LEVELS), TIMES),
         begins=np.arange(times) == 0,
     )

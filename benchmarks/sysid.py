@@ -4,8 +4,9 @@ The objective is the directed Hausdorff distance from simulated to measured curv
 and knee of both legs. All methods have the same bounds, for the paper's eight parameters and for twelve (with torque
 limits and slack):
 
-- ours: `ballu_mjx.ballu.leg_fit` from settled angles only, with either objective. The time is that of a second run.
-  Compiling, once for each size of sweep, is reported separately.
+- ours: `ballu_mjx.ballu.leg_fit` from settled angles only, with either objective. It also keeps the servos' gain below
+  `leg_parameters.largest_motor_gain`. The time is that of a second run. Compiling, once for each size of sweep, is
+  reported separately.
 - the paper's way: SciPy's L-BFGS-B from the nominal values, with finite differences through C MuJoCo. Two measures
   speed it up. The parameters of both legs are perturbed at once, because neither leg affects the other. The joints are
   damped so that they settle early.

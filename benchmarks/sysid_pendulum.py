@@ -217,16 +217,20 @@ def finite_differences(
     parameters: ParameterSet, simulator: WindowRollouts, judge: WindowRollouts, start: np.ndarray, iterations: int
 ) -> Found:
     """Identify by L-BFGS-B with finite differences."""
-    size = len(parameters)
+    size, places = len(parameters), []
 
     def function(place: np.ndarray) -> tuple[float, np.ndarray]:
+        places.append(place.copy())
         steps = np.where(place + DIFFERENCE > 1, -DIFFERENCE, DIFFERENCE)
-        places = place + np.concatenate([np.zeros((1, size)), np.diag(steps)])
-        values = simulator.objectives(parameters.at_shares(places))
+        beside = place + np.concatenate([np.zeros((1, size)), np.diag(steps)])
+        values = simulator.objectives(parameters.at_shares(beside))
         return float(values[0]), (values[1:] - values[0]) / steps
 
-    place, seconds, trace = lbfgsb(function, parameters.shares(start), iterations)
+    place, seconds, own = lbfgsb(function, parameters.shares(start), iterations)
     values = parameters.at_shares(place)
+    # The first call is not timed.
+    visited = [(when, parameters.at_shares(each)) for (when, _), each in zip(own, places[1:], strict=True)]
+    trace = judged(judge, visited)
     return Found("L-BFGS-B", size, seconds, None, float(judge.objectives(values[None])[0]), trace, values)
 
 

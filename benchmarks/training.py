@@ -8,8 +8,8 @@ normalized as its authors recommend. It runs with one, two or four processes per
 Times are measured from the start of the process, including imports and compiling. The first result is the wall time
 until the mean reward of the last 100,000 control steps, with exploration, reaches the target. The second is the number
 of control steps per second, including learning, as the median over batches. Ours is measured with an empty cache of
-compiled programs (cold) and with a full one (warm). A slow method needs a long time for those 100,000 steps. So the
-times until a single batch reaches the target are compared too.
+compiled programs (cold, for the first seed only) and with a full one (warm). A slow method needs a long time for those
+100,000 steps. So the times until a single batch reaches the target are compared too.
 
 If MuJoCo Playground is installed (`pip install playground`), its speed is measured on its most similar task without
 downloads. This is the planar walker of DeepMind's Control Suite, with Brax's PPO and batches of our size.
@@ -53,7 +53,8 @@ class Options:
     target: float = 0.2
     """Target of the mean reward (m/s)."""
     seeds: tuple[int, ...] = (0, 1, 2, 3, 4)
-    """Seeds. Each method trains once for every seed, and ratios are of medians over seeds."""
+    """Seeds. Each method trains once for every seed (ours with a cold cache: for the first only). Ratios are of medians
+    over seeds."""
     steps: int = 3_000_000
     """Control steps after which a training ends if it has not reached the target."""
     output: Path = Path("runs/bench-training")
@@ -342,7 +343,10 @@ def main(options: Options) -> None:
 
 
 def compare(rows: list[dict[str, Any]]) -> dict[str, float]:
-    """Return ratios of speed and time between ours and the better variant of Stable-Baselines3 (medians over seeds)."""
+    """Return ratios of speed and time between ours and the better variant of Stable-Baselines3.
+
+    They are of medians over seeds. With a cold cache, ours is one run of the first seed.
+    """
 
     def median(kind: str, cache: str, name: str) -> float:
         values = [row[name] for row in rows if (row["kind"], row["cache"]) == (kind, cache)]

@@ -73,7 +73,7 @@ def identify_legs(
     3. In the richer model, the springs are held at their nominal stiffness, which sets the scale of all forces
        (`nominal_springs`).
     4. With the richer model, or if the data leave directions open, the fit continues with the priors. Parameters that a
-       sweep hardly shows then stay near their nominal values.
+       sweep hardly shows then stay near their nominal values, and the dynamics near `INITIAL_DYNAMICS`.
     5. With `objective="hausdorff"`, the paper's distance between curves is minimized from there.
 
     **Raises** `InputError` from `check_identification_config`.

@@ -46,7 +46,7 @@ class LegData(NamedTuple):
     weights: Float[np.ndarray, "legs holds 2"]
     """Square roots of the number of samples in each mean, reduced for joints that still creep."""
     commanded: Float[np.ndarray, "legs times"]
-    """Command at each time of the motion."""
+    """Mean command from each time of the motion to the next."""
     motion: Float[np.ndarray, "legs times 2"]
     """Measured angles (rad) at each time."""
     counts: Bool[np.ndarray, " times"]
@@ -65,7 +65,7 @@ def leg_data(sweep: Sweep) -> LegData:
         command=sweep.command.T,
         settled=np.moveaxis(sweep.settled, -1, 0),
         weights=np.sqrt(sweep.samples)[:, None] * still,
-        commanded=sweep.command[sweep.hold[rows]].T,
+        commanded=sweep.commanded[rows].T,
         motion=np.moveaxis(sweep.motion[rows], -1, 0),
         counts=~before,
         begins=before & ~np.roll(before, 1),
@@ -206,7 +206,9 @@ class LegResiduals:
     ) -> tuple[Float[np.ndarray, "legs rows"], Float[np.ndarray, "legs rows size"]]:
         """Return residuals divided by `spread`, followed by those of the priors, and their Jacobians.
 
-        The residuals of the priors are the distances of parameters from nominal, in standard deviations among robots.
+        The residuals of the priors are distances in standard deviations among robots. Parameters that settled angles
+        depend on have them from nominal. The dynamics have them from `INITIAL_DYNAMICS`: their coordinates are
+        logarithms, and most of their nominal values are 0.
         """
         values, jacobians = self(coordinates, kept)
         space, size = self.space, self.size

@@ -17,7 +17,7 @@ from ballu_mjx.ballu.leg_parameters import INITIAL_DYNAMICS, LEG_PARAMETERS, Leg
 from ballu_mjx.ballu.model import SIDES, load_suspended_leg
 from ballu_mjx.ballu.sweep import SAMPLE_TIMESTEP
 from ballu_mjx.identification.batched_solver import directional_derivatives
-from ballu_mjx.robots.model import with_fields
+from ballu_mjx.robots.model import raise_iterations, with_fields
 from ballu_mjx.sim.drivetrain import DrivetrainState, init_drivetrain, step_drivetrain
 from ballu_mjx.sim.step import PhysicsState, make_data, physics_step, put_model, state_at
 from ballu_mjx.sim.vmap_last import vmap_with_trailing_batch
@@ -47,6 +47,7 @@ class SuspendedLeg:
             INITIAL_DYNAMICS.motor_friction,
             INITIAL_DYNAMICS.knee_friction,
         )  # not 0, because MJX leaves out joints without dry friction
+        raise_iterations(with_friction)
         self._friction_model = put_model(with_friction)
         self._friction_data = make_data(with_friction)
         self._relaxation_damping = np.zeros(self.model.nv)
@@ -81,7 +82,7 @@ class SuspendedLeg:
 
         **Arguments**
 
-        - `command`: command at each time, held until the next.
+        - `command`: mean command from each time to the next.
         - `begins`: times at which the leg is set to rest at the default angles, and the backlash to its middle.
         """
         timestep = float(self.model.opt.timestep)

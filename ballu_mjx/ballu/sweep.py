@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 from ballu_mjx.ballu.model import SIDES
 from ballu_mjx.ballu.recordings import knee, motor
 from ballu_mjx.common.errors import InputError
+from ballu_mjx.recordings.filters import mean_command
 from ballu_mjx.recordings.recording import Recording
 
 LEVELS = 20
@@ -55,6 +56,8 @@ class Sweep:
     """Number of samples in this window."""
     motion: Float[np.ndarray, "times 2 2"]
     """All angles (rad), every `SAMPLE_TIMESTEP`, one recording after the other."""
+    commanded: Float[np.ndarray, "times 2"]
+    """Mean command (left, right) from each of these times to the next. A command may change in between."""
     hold: Int[np.ndarray, " times"]
     """Index of the hold at each of these times."""
     begins: Bool[np.ndarray, " times"]
@@ -84,7 +87,7 @@ class Sweep:
         """Return a sweep with the settled angles of all holds except those in `left_out`, and without motion."""
         kept = np.setdiff1d(np.arange(len(self.command)), left_out)
         settled = {name: getattr(self, name)[kept] for name in ("command", "settled", "drift", "samples")}
-        motion = {name: getattr(self, name)[:0] for name in ("motion", "hold", "begins")}
+        motion = {name: getattr(self, name)[:0] for name in ("motion", "commanded", "hold", "begins")}
         return dataclasses.replace(self, **settled, **motion)
 
 
@@ -118,12 +121,13 @@ def read_sweep(recordings: Mapping[Path, Recording], *, levels: int = LEVELS) ->
             )
         parts.append(_holds(path, recording))
     firsts = np.cumsum([0] + [len(part[0]) for part in parts])
-    command, settled, drift, samples, motion = (np.concatenate([part[i] for part in parts]) for i in range(5))
-    hold = np.concatenate([part[5] + first for part, first in zip(parts, firsts, strict=False)])
-    begins = np.concatenate([np.arange(len(part[5])) == 0 for part in parts])
+    joined = [np.concatenate([part[i] for part in parts]) for i in range(6)]
+    command, settled, drift, samples, motion, commanded = joined
+    hold = np.concatenate([part[6] + first for part, first in zip(parts, firsts, strict=False)])
+    begins = np.concatenate([np.arange(len(part[6])) == 0 for part in parts])
     for index, side in enumerate(SIDES):
         _check_levels(names, side, command[:, index], levels)
-    return Sweep(robots[0], command, settled, drift, samples, motion, hold, begins)
+    return Sweep(robots[0], command, settled, drift, samples, motion, commanded, hold, begins)
 
 
 def _check_levels(names: str, side: str, command: Float[np.ndarray, " holds"], levels: int) -> None:
@@ -147,7 +151,8 @@ def _check_levels(names: str, side: str, command: Float[np.ndarray, " holds"], l
 
 
 def _holds(path: Path, recording: Recording) -> tuple[np.ndarray, ...]:
-    """Return the command, settled angles, drift and number of samples of each hold, the motion, and its hold indices.
+    """Return the command, settled angles, drift and number of samples of each hold, the motion, its mean commands, and
+    its hold indices.
 
     All are those of one recording, in the order of the fields of `Sweep`.
     """
@@ -180,6 +185,7 @@ def _holds(path: Path, recording: Recording) -> tuple[np.ndarray, ...]:
     grid = np.arange(time[0], time[-1] + 1e-9, SAMPLE_TIMESTEP)
     flat = angles.reshape(len(time), 4)
     motion = np.stack([np.interp(grid, time, column) for column in flat.T], axis=1).reshape(-1, 2, 2)
+    commanded = np.concatenate([mean_command(recording, grid - time[0]), recording.command[-1:]])
     hold = np.searchsorted(time[starts], grid + 1e-9, side="right") - 1
     command = recording.command[starts]
-    return command, np.array(settled), np.array(drifts), np.array(samples), motion, hold
+    return command, np.array(settled), np.array(drifts), np.array(samples), motion, commanded, hold

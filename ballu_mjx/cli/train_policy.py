@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from ballu_mjx.cli._command import TrainCommand, load_chosen_robot, open_run, start_from, written_to
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.identification.actuators import AUTO, NOMINAL, read_actuators, validation_ratio
+from ballu_mjx.identification.actuators import AUTO, NOMINAL, read_actuators, read_validation
 from ballu_mjx.policies.closed_loop import Rollout
 from ballu_mjx.policies.locomotion_config import LocomotionConfig, check_task
 from ballu_mjx.policies.locomotion_env import variant_of
@@ -125,11 +125,12 @@ def train(task: Task, data: Data, env: LocomotionConfig, ppo: PPOConfig) -> int:
 
 def _verdict(path: Path) -> str:
     """Return how identified actuators compare with nominal ones according to their file, as text in parentheses."""
-    ratio = validation_ratio(path)
-    if ratio is None:
+    found = read_validation(path)
+    if found is None:
         return ""
-    better = "better" if ratio < 1 else "WORSE"
-    return f" (replayed validation recordings {better} than nominal ones, with {ratio:.2f} times the error)"
+    better = "better" if found.improves else "WORSE"
+    why = "and more replays diverged" if found.ratio is None else f"with {found.ratio:.2f} times the error"
+    return f" (replayed validation recordings {better} than nominal ones, {why})"
 
 
 def summary(task: Task, rollout: Rollout, robot: RobotDescription, with_residual: bool) -> str:

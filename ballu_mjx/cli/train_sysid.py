@@ -205,7 +205,7 @@ def data_check(seen: Visibility) -> str:
         return f"Data check: these recordings show all {len(seen.names)} parameters."
     return (
         f"Data check: these recordings cannot show {', '.join(seen.unseen)}. A change as large as the spread among "
-        "robots is hidden by the noise; these stay at their nominal values, or at those of --actuators."
+        "robots is hidden by the noise; these stay near their nominal values, or near those of --actuators."
     )
 
 
@@ -213,7 +213,8 @@ def _actuators_json(robot: RobotDescription, found: IdentifiedByFit, paths: Sequ
     assert isinstance(found.parameters, IdentifiedParameters)
     more: dict[str, Any] = {"source": [describe_recording(path) for path in paths]}
     if found.choice is not None:
-        more["validation"] = {"ratio": found.choice.ratio, "improves": found.choice.improves}
+        ratio = found.choice.ratio  # infinite if more replays diverged, which JSON cannot express
+        more["validation"] = {"ratio": ratio if np.isfinite(ratio) else None, "improves": found.choice.improves}
     errors = found.fit.standard_errors
     return identified_to_json(robot, found.parameters, errors, specimen=found.robot, more=more)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError, is_number
@@ -85,14 +85,22 @@ def read_actuators(robot: RobotDescription, path: Path) -> tuple[str, ModelParam
     return robot.adapter.read_actuators(robot, path)
 
 
-def validation_ratio(path: Path) -> float | None:
-    """Return the ratio of identified to nominal error on the validation recordings of the identification.
+class Validation(NamedTuple):
+    """Comparison of identified and nominal actuators on the validation recordings of the identification."""
 
-    The ratio is read from the file of identified actuators. None if the file does not contain it.
-    """
+    improves: bool
+    """Whether the identified actuators replay them better."""
+    ratio: float | None
+    """Identified over nominal error. None if more replays diverge with the identified actuators."""
+
+
+def read_validation(path: Path) -> Validation | None:
+    """Return the comparison that a file of identified actuators contains. None if it contains none."""
     found = files.read_json(path, "restore it or identify again").get("validation")
-    ratio = found.get("ratio") if isinstance(found, dict) else None
-    return float(ratio) if ratio is not None and is_number(ratio) else None
+    if not isinstance(found, dict) or not isinstance(found.get("improves"), bool):
+        return None
+    ratio = found.get("ratio")
+    return Validation(found["improves"], float(ratio) if ratio is not None and is_number(ratio) else None)
 
 
 def find_actuators(robot: RobotDescription, recordings: Iterable[Path], specimen: str) -> Path | None:

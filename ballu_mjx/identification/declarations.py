@@ -14,8 +14,9 @@ to identify:
 - Any other numeric field of an element, by MuJoCo's name: `{"joint": "hinge", "field": "jnt_range", "index": 0}`.
 
 Elements in a list share one value: `{"joint": ["hinge_left", "hinge_right"], ...}`. `"targets"` is a list of
-element-field pairs, each with an optional `"factor"`. It ties different fields to one value. Optional keys: `name`,
-`unit`, `bounds`, `prior` (standard deviation among robots), `nominal`.
+element-field pairs, each with an optional `"factor"`. It ties different fields to one value. One of a body's ten mass
+properties is tied only to the same one of other bodies. It has a factor only if its nominal value is 0 (com and shear).
+Optional keys: `name`, `unit`, `bounds`, `prior` (standard deviation among robots), `nominal`.
 
 A shared `mass` has the value of the first body. With factors, the value is that of the first target over its factor.
 The inertia of a body is parametrized by a deformation of its nominal mass distribution. The parameters are stretches
@@ -199,6 +200,9 @@ class _Declaration:
     def _parts(self) -> list[tuple[str, str, str, float]]:
         """Return (kind, element, field, factor) of each target of the entry."""
         if "targets" in self.entry:
+            for key in (*_ELEMENTS, *_TARGET_KEYS):
+                if key in self.entry:
+                    self.refuse(f'has the key "{key}" beside "targets"', "write it in a target")
             targets = self.entry["targets"]
             if not isinstance(targets, list) or not targets or not all(isinstance(each, dict) for each in targets):
                 self.refuse(
@@ -335,16 +339,21 @@ class _Declaration:
                 "give it a mass above 0, and moments of inertia that are each smaller than the sum of the other two",
             )
         for kind, element, field, factor in parts:
-            if kind != "body" or field != parts[0][2] or factor != 1.0:
+            if kind != "body" or field != parts[0][2]:
                 self.refuse(
                     "ties a body's mass properties to another quantity", "tie them to those of other bodies only"
                 )
+            if factor != 1.0 and UNDEFORMED[place] != 0:
+                self.refuse(
+                    f'has a "factor" of {quantity}', "leave it out: bodies that share mass or stretch keep their ratio"
+                )
             body = self._id("body", element)
-            targets.append(BodyTarget(body, place, 1 / mass if quantity == "mass" else 1.0))
+            targets.append(BodyTarget(body, place, 1 / mass if quantity == "mass" else factor))
         nominal = mass if quantity == "mass" else UNDEFORMED[place]
         name = "_and_".join(part[1] for part in parts) + f"_{quantity}"
         group = len(_BODY_GROUPS[parts[0][2]]) > 1
-        reach = _RADIUS * math.sqrt(float(inertia.sum()) / 2 / mass) if quantity.startswith("com_") else _RADIUS
+        radius = math.sqrt(float(inertia.sum()) / 2 / mass) if quantity.startswith("com_") else 1.0
+        reach = _RADIUS * radius / abs(parts[0][3])
         bounds = (-reach, reach) if nominal == 0 else (nominal / _FACTOR, nominal * _FACTOR)
         for key in ("nominal", "unit", *(("bounds", "prior") if group else ())):
             if key in self.entry:
@@ -367,7 +376,7 @@ class _Declaration:
         bounds: tuple[float, float] | None = None
         if nominal > 0 and math.isfinite(nominal) and field not in _SIGNED:
             bounds = nominal / _FACTOR, nominal * _FACTOR
-        prior = math.nan
+        span = 0.0
         if kind == "command":
             low, high = self.robot.command_ranges[self.robot.commands.index(element)]
             span = high - low
@@ -379,11 +388,15 @@ class _Declaration:
                 "rate_limit": (0.1 * span, span / float(self.model.opt.timestep)),
                 "lag": (0.0, 0.2),
             }[field]
-            prior = {"scale": 0.1, "delay": 0.02, "lag": 0.03, "rate_limit": math.inf}.get(field, 0.05 * span)
         bounds = self._bounds(bounds, nominal)
         nominal = min(nominal, bounds[1])
-        if math.isnan(prior):
-            prior = _SPREAD * nominal if nominal > 0 and field not in _SIGNED else (bounds[1] - bounds[0]) / 4
+        if kind == "command":
+            # The prior of a rate limit is wide, because its nominal value means that no limit is known.
+            prior = {"scale": 0.1, "delay": 0.02, "lag": 0.03, "rate_limit": nominal}.get(field, 0.05 * span)
+        elif nominal > 0 and field not in _SIGNED:
+            prior = _SPREAD * nominal
+        else:
+            prior = (bounds[1] - bounds[0]) / 4
         if field not in _SIGNED and bounds[0] < 0 and field in self._known(kind):
             self.refuse(f'has "bounds" that begin at {bounds[0]:g}', f"{field} must be 0 or more")
         return Parameter(

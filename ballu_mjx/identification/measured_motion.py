@@ -8,11 +8,12 @@ from functools import partial
 import mujoco
 import numpy as np
 from jaxtyping import Float
+from scipy.signal import savgol_coeffs
 
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.recordings.filters import interpolate, mean_command, savitzky_golay
+from ballu_mjx.recordings.filters import interpolate, mean_command, odd_window, savitzky_golay
 from ballu_mjx.recordings.motion import Motion, ReconstructionParameters
-from ballu_mjx.recordings.reconstruct import unwound
+from ballu_mjx.recordings.filters import unwound
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.robots.description import RobotDescription
 
@@ -78,7 +79,8 @@ def measure(
     """Return a recording of all joints of an anchored robot, in the form that identification takes.
 
     The noise of velocities is the standard deviation of the difference between filters of the full and of half the
-    width. It contains the noise that the narrow filter passes and the motion that the wide filter removes.
+    width. It contains the noise that the narrow filter passes and the motion that the wide filter removes. It is not
+    below the noise of angles that the wide filter passes: with few samples, both filters have the same width.
 
     **Raises** `InputError` naming a joint that was not recorded, or a recording that is too short.
     """
@@ -105,6 +107,8 @@ def measure(
     angles = interpolate(grid, time, np.stack(counted, axis=1))
     filtered = partial(savitzky_golay, angles, step=sample / fine, order=config.order)
     rates, narrow = (filtered(width, derivative=1) for width in (config.rate_window, config.rate_window / 2))
+    window = odd_window(config.rate_window, sample / fine, config.order, len(grid))
+    passed = config.angle_noise * np.linalg.norm(savgol_coeffs(window, config.order, deriv=1, delta=sample / fine))
     uncertainty = np.hypot(np.std(rates - narrow, axis=0), _SURE * np.std(rates, axis=0) + 1e-6)
     # A semi-implicit integrator's velocity is the mean over the time step that led to the position.
     rates = rates - np.gradient(rates, sample / fine, axis=0) * timestep / 2
@@ -118,7 +122,7 @@ def measure(
         start_qpos=filtered(config.position_window, derivative=0)[here],
         qvel=rates[here],
         position_noise=np.full(model.nv, config.angle_noise),
-        velocity_noise=uncertainty,
+        velocity_noise=np.maximum(uncertainty, passed),
     )
 
 

@@ -25,7 +25,7 @@ from ballu_mjx.common.errors import InputError
 from ballu_mjx.common.rotations import quaternion_conjugate, quaternion_integrate, quaternion_product
 from ballu_mjx.identification.measured_motion import MeasuredMotion
 from ballu_mjx.identification.parameters import LEAST_FRICTION, ParameterSet
-from ballu_mjx.robots.model import with_fields
+from ballu_mjx.robots.model import raise_iterations, with_fields
 from ballu_mjx.sim.derived_constants import ReferencePose, with_derived_constants
 from ballu_mjx.sim.drivetrain import filter_commands
 from ballu_mjx.sim.sharding import chunks, shard_over_devices
@@ -276,13 +276,17 @@ DIVERGED = 1e3
 
 
 def _with_friction_rows(model: mujoco.MjModel, parameters: ParameterSet) -> mujoco.MjModel:
-    """Return a copy with dry friction above 0 where it is a parameter. MJX omits friction rows that are 0 at first."""
+    """Return a copy with dry friction above 0 where it is a parameter. MJX omits friction rows that are 0 at first.
+
+    The solver makes as many iterations as in simulations with the identified values (`robots.model.load_model`).
+    """
     model = copy.copy(model)
     for field, places in (
         (model.dof_frictionloss, parameters.friction_dofs),
         (model.tendon_frictionloss, parameters.friction_tendons),
     ):
         field[places] = np.maximum(field[places], LEAST_FRICTION)
+    raise_iterations(model)
     return model
 
 

@@ -16,9 +16,9 @@ from jaxtyping import Float
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError, is_number
 from ballu_mjx.identification.declarations import declared_parameters
-from ballu_mjx.identification.parameters import FieldTarget, IdentifiedParameters
+from ballu_mjx.identification.parameters import IdentifiedParameters
 from ballu_mjx.robots.description import RobotDescription
-from ballu_mjx.robots.mjcf import write_fields
+from ballu_mjx.robots.mjcf import WRITTEN_FIELDS, differing_fields, write_fields
 from ballu_mjx.robots.model import raise_iterations, set_fields
 
 IDENTIFIED_FORMAT = "ballu-identified/1"
@@ -88,7 +88,8 @@ def identified_xml(robot: RobotDescription, identified: IdentifiedParameters) ->
     MJCF cannot express the drivetrain, which is written in a comment at the top. Paths of meshes and textures stay
     relative to the robot's MJCF file. Numbers have six digits, as MuJoCo writes them.
 
-    **Raises** `InputError` for a field that cannot be set in MuJoCo's model specification (`mujoco.MjSpec`).
+    **Raises** `InputError` for a field that cannot be set in MuJoCo's model specification (`mujoco.MjSpec`), or that
+    its compiler changes.
     """
     model = robot.load_model()
     with jax.enable_x64(True):
@@ -97,13 +98,9 @@ def identified_xml(robot: RobotDescription, identified: IdentifiedParameters) ->
     raise_iterations(model)
     spec = mujoco.MjSpec.from_file(str(robot.model))
     write_fields(spec, model)
-    targets = [target for parameter in identified.declared.parameters for target in parameter.targets]
-    compiled = spec.compile()
-    for target in targets:
-        if isinstance(target, FieldTarget):
-            got, wanted = (getattr(m, target.field)[target.index] for m in (compiled, model))
-            if not np.isclose(got, wanted, rtol=1e-5, atol=1e-8):
-                raise InputError(f"{robot.file}: {target.field} cannot be written as MJCF; keep it in the JSON file.")
+    lost = differing_fields(spec.compile(), model, [*WRITTEN_FIELDS, *fields])
+    if lost:
+        raise InputError(f"{robot.file}: {lost[0]} cannot be written as MJCF; keep it in the JSON file.")
     head, _, rest = spec.to_xml().partition("\n")
     return f"{head}\n  <!-- {_drivetrain_words(robot, identified)} -->\n{rest}"
 

@@ -23,7 +23,7 @@ class ReconstructionParameters:
     rotation_noise: float = float(np.deg2rad(0.3))
     """Standard deviation (rad) of a measured orientation, per axis."""
     joint_noise: float = float(np.deg2rad(0.3))
-    """Standard deviation of a measured joint angle (rad), or of a slide's displacement (m)."""
+    """Standard deviation (rad) of a measured joint angle. A slide has `position_noise`."""
     position_window: float = 0.09
     """Width (s) of the Savitzky-Golay filter of the root's position and of all joints."""
     rate_window: float = 0.19

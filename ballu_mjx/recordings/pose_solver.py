@@ -87,7 +87,8 @@ class PoseSolver:
         self.measurements = places + len(self._couplings) + len(self.recorded)
         """Number of scalar measurements of each sample, including closed loops."""
         self.joint_weight, self.prior_weight = np.zeros(model.nv), np.zeros(model.nv)
-        self.joint_weight[self.dofs[self.recorded]] = 1.0 / parameters.joint_noise
+        self._joint_noise = np.where(self.tree.rotates, parameters.joint_noise, parameters.position_noise)
+        self.joint_weight[self.dofs[self.recorded]] = 1.0 / self._joint_noise[self.dofs[self.recorded]]
         self.prior_weight[self.dofs[self.hidden]] = 1.0 / _PRIOR
 
     # ---- misfit ----
@@ -116,8 +117,9 @@ class PoseSolver:
             jacobians.append((self.tree.point_jacobian(poses, one) - self.tree.point_jacobian(poses, other)) / noise)
         for coupling in self._couplings:
             error, jacobian = coupling.misfit(qpos, self.problem.model.nv)
-            errors.append(error[:, None] / (_LOOP_NOISE * parameters.joint_noise))
-            jacobians.append(jacobian[:, None] / (_LOOP_NOISE * parameters.joint_noise))
+            coupled = _LOOP_NOISE * self._joint_noise[coupling.dof]
+            errors.append(error[:, None] / coupled)
+            jacobians.append(jacobian[:, None] / coupled)
         return np.concatenate(errors, axis=1), np.concatenate(jacobians, axis=1)
 
     def information(self, qpos: Float[np.ndarray, "T nq"], rows: Int[np.ndarray, " T"]) -> np.ndarray:

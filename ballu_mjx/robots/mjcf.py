@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
+from jaxtyping import Float
 
 from ballu_mjx.common.errors import InputError
+from ballu_mjx.common.rotations import quaternion_to_matrix
 
 _ELEMENTS: Mapping[str, tuple[str, str]] = {
     "dof_damping": ("joints", "damping"),
@@ -36,6 +38,12 @@ _ANGLES = ("jnt_range", "qpos_spring")
 """Fields that are angles for `_ANGULAR` joints. A specification may have them in degrees, compiled models in rad."""
 _ANGULAR = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_BALL))
 _INERTIAL = ("body_mass", "body_ipos", "body_iquat", "body_inertia")
+_ROTATED = ("body_iquat", "body_inertia")
+"""Fields that form an inertia tensor together. Several pairs of principal axes and moments form the same one."""
+WRITTEN_FIELDS = (*_ELEMENTS, *_INERTIAL)
+"""Fields of the compiled model that `write_fields` writes."""
+_ROUNDING = 1e-5
+"""Relative difference of two values that count as equal."""
 _ASSETS = "assets"
 
 
@@ -66,6 +74,7 @@ def write_fields(spec: mujoco.MjSpec, wanted: mujoco.MjModel) -> None:
     Fields without an attribute in the specification are skipped.
     """
     base = spec.compile()
+    _hold_computed_values(spec, base)
     spec.option.iterations = wanted.opt.iterations
     for field, (kind, own) in _ELEMENTS.items():
         old, new = (getattr(model, field) for model in (base, wanted))
@@ -96,7 +105,43 @@ def write_fields(spec: mujoco.MjSpec, wanted: mujoco.MjModel) -> None:
             body.explicitinertial = True
             body.mass, body.ipos = wanted.body_mass[body.id], wanted.body_ipos[body.id]
             body.iquat, body.inertia = wanted.body_iquat[body.id], wanted.body_inertia[body.id]
-            body.fullinertia = [np.nan, 0, 0, 0, 0, 0]
+            # The compiler would compute both again from a full inertia matrix, and the axes from an angle.
+            body.fullinertia, body.ialt.type = [np.nan, 0, 0, 0, 0, 0], mujoco.mjtOrientation.mjORIENTATION_QUAT
+
+
+def differing_fields(one: mujoco.MjModel, other: mujoco.MjModel, names: Iterable[str]) -> tuple[str, ...]:
+    """Return the fields among `names` in which two compiled models differ by more than rounding.
+
+    Principal axes and moments are compared as inertia tensors.
+    """
+    return tuple(name for name in names if not _agree(one, other, name))
+
+
+def _agree(one: mujoco.MjModel, other: mujoco.MjModel, name: str) -> bool:
+    if name in _ROTATED:
+        far = np.abs(_inertia_tensors(one) - _inertia_tensors(other)).max(axis=(1, 2))
+        return bool(np.all(far <= _ROUNDING * other.body_inertia.max(axis=1)))
+    return np.allclose(getattr(one, name), getattr(other, name), rtol=_ROUNDING, atol=1e-8, equal_nan=True)
+
+
+def _inertia_tensors(model: mujoco.MjModel) -> Float[np.ndarray, "bodies 3 3"]:
+    axes = quaternion_to_matrix(model.body_iquat)
+    return np.einsum("bij,bj,bkj->bik", axes, model.body_inertia, axes)
+
+
+def _hold_computed_values(spec: mujoco.MjSpec, base: mujoco.MjModel) -> None:
+    """Replace attributes from which the compiler computes values by these values, in place.
+
+    With changed masses the compiler would compute other values. `base` is the compiled specification.
+    """
+    for actuator in spec.actuators:
+        if actuator.biasprm[2] > 0:  # a damping ratio
+            actuator.biasprm[2] = base.actuator_biasprm[actuator.id, 2]
+    for joint in spec.joints:
+        if joint.springdamper.all():
+            joint.springdamper = np.zeros(2)
+            joint.stiffness[0] = base.jnt_stiffness[joint.id]
+            joint.damping[0] = base.dof_damping[base.jnt_dofadr[joint.id]]
 
 
 def _copy_assets(spec: mujoco.MjSpec, file: Path, folder: Path) -> None:

@@ -107,8 +107,7 @@ def step_drivetrain(
     limited = jnp.clip(arrived, state.limited - most, state.limited + most)
     # Backward Euler is exactly the identity at lag 0 and has a finite derivative there. It delays a ramp by the lag.
     lagged = limited + (state.lagged - limited) * (parameters.lag / (parameters.lag + timestep))
-    half = parameters.backlash / 2
-    after_backlash = jnp.clip(state.after_backlash, lagged - half, lagged + half)
+    after_backlash = _after_backlash(parameters.backlash / 2, state, lagged)
     return DrivetrainState(sent, limited, lagged, after_backlash), after_backlash
 
 
@@ -131,6 +130,19 @@ def filter_commands(
 ) -> Float[Array, "steps commands"]:
     """Return the actuators' `ctrl` in each physics step, starting at rest under the first command."""
     return scan_drivetrain(parameters, init_drivetrain(parameters, commands[0], slots), commands, timestep)[1]
+
+
+def _after_backlash(
+    half: Float[Array, " commands"], state: DrivetrainState, lagged: Float[Array, " commands"]
+) -> Float[Array, " commands"]:
+    """Return the previous output, clipped to `lagged` plus and minus half the backlash."""
+    low, high, before, wide = lagged - half, lagged + half, state.after_backlash, half > 0
+    # `clip` would halve derivatives at its bounds. An output at a bound follows that bound while a command is held.
+    rises, falls = (before < low) | (wide & (before == low)), (before > high) | (wide & (before == high))
+    # Without backlash the bounds are equal. The output follows every command there, and the derivative with respect to
+    # the backlash is that of the last move: its offset from the command stays the same.
+    held = jnp.where(wide, before, lagged + (before - state.lagged))
+    return jnp.where(rises, low, jnp.where(falls, high, held))
 
 
 def _delayed(sent: Float[Array, "slots commands"], late: Float[Array, " commands"]) -> Float[Array, " commands"]:

@@ -78,6 +78,7 @@ def blank(hold: int = HOLD) -> Sweep:
         drift=np.zeros((20, 2, 2)),
         samples=np.full(20, 50),
         motion=np.zeros((times, 2, 2)),
+        commanded=np.repeat(COMMANDS, hold)[:, None].repeat(2, axis=1),
         hold=np.repeat(np.arange(20), hold),
         begins=np.arange(times) == 0,
     )

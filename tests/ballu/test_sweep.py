@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ballu_mjx.ballu.leg_residuals import leg_data
 from ballu_mjx.ballu.recordings import make_recording
 from ballu_mjx.ballu.sweep import read_sweep
 from ballu_mjx.common.errors import InputError
@@ -63,6 +64,14 @@ def test_clock_jitter_and_origin_do_not_change_the_sweep() -> None:
     length = min(len(sweep.motion), len(expected.motion))
     # Samples dropped at a change of command move the change by 5 ms each. A step of 0.053 rad decays in 50 ms.
     assert sweep.motion[:length] == pytest.approx(expected.motion[:length], abs=0.02)
+
+
+def test_commands_that_change_between_two_samples_of_the_motion_have_their_effect_in_time() -> None:
+    recording = exponential_sweep(both_legs(), hold=1.003, rate=1000.0)
+    after_rest = leg_data(read_sweep({PATH: recording}))
+    given = after_rest.commanded[0, after_rest.counts]
+    exact = np.cumsum(recording.command[:, 0])[9::10] / 1000  # integral up to each time but the first
+    assert np.cumsum(given)[: len(exact)] * 0.01 == pytest.approx(exact, abs=1e-6)
 
 
 def test_legs_swept_one_after_the_other_make_one_sweep() -> None:

@@ -7,6 +7,8 @@ import json
 import re
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -15,9 +17,12 @@ from servo_arm import IDENTIFY, TRUTH, identified, record_arm, write_arm, write_
 
 from ballu_mjx.cli import train
 from ballu_mjx.cli._residual import prepare
+from ballu_mjx.cli.train_policy import _verdict
+from ballu_mjx.cli.train_sysid import _actuators_json
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.identification.actuators import ACTUATORS_FILE, read_actuators, validation_ratio
-from ballu_mjx.identification.declared import check_recordings
+from ballu_mjx.identification.actuator_choice import Choice, ReplayErrors, ReplayRow
+from ballu_mjx.identification.actuators import ACTUATORS_FILE, read_actuators, read_validation
+from ballu_mjx.identification.declared import IdentifiedByFit, check_recordings
 from ballu_mjx.identification.measured_motion import SamplingConfig
 from ballu_mjx.identification.parameters import IdentifiedParameters
 from ballu_mjx.identification.write_back import identified_to_json
@@ -74,7 +79,8 @@ def test_sysid_identifies_the_arm_and_writes_all_files(robot: RobotDescription, 
     folder, printed = run
     name, found = read_actuators(robot, folder / ACTUATORS_FILE)
     assert name == "arm" and isinstance(found, IdentifiedParameters)
-    assert 0 < (validation_ratio(folder / ACTUATORS_FILE) or 0) < 0.2
+    validation = read_validation(folder / ACTUATORS_FILE)
+    assert validation is not None and validation.improves and 0 < (validation.ratio or 0) < 0.2
     for parameter, value in zip(found.declared.names, np.asarray(found.values), strict=True):
         assert value == pytest.approx(TRUTH[parameter], rel=0.1), parameter
     assert "these recordings show all 5 parameters" in printed
@@ -94,6 +100,23 @@ def test_sysid_identifies_the_arm_and_writes_all_files(robot: RobotDescription, 
     page = (folder / "report.html").read_text()
     assert "shoulder_backlash" in page and "95 % from" in page and "held_out.png" in page
     assert any("search" in json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines())
+
+
+@pytest.mark.parametrize(
+    ("diverged", "verdict"), [(0, "better than nominal ones, with 0.50"), (2, "WORSE than nominal")]
+)
+def test_later_commands_read_from_the_file_whether_identification_improves(tmp_path: Path, diverged: int, verdict: str):
+    """If more replays diverge with identified actuators, their error is infinite, which JSON cannot express."""
+    robot = write_arm(tmp_path)
+    nominal, own = ReplayErrors(0.2, 0.2, 0), ReplayErrors(0.1, 0.1, diverged)
+    parameters, errors = identified(robot, **TRUTH), np.ones(len(TRUTH))
+    choice = Choice(parameters, (ReplayRow("motion", 1.0, 3, nominal, own),), "joints")
+    fit: Any = SimpleNamespace(standard_errors=errors)
+    found = IdentifiedByFit("arm", parameters, "", {}, fit=fit, held_out=(), choice=choice, suggestions=())
+    file = tmp_path / ACTUATORS_FILE
+    file.write_text(_actuators_json(robot, found, []))
+    json.loads(file.read_text(), parse_constant=lambda constant: pytest.fail(f"{constant} is not JSON"))
+    assert verdict in _verdict(file)
 
 
 @pytest.mark.slow

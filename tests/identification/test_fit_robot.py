@@ -6,21 +6,25 @@ import json
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 from robot_files import write_robot
+from servo_arm import write_arm
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.identification.declarations import declared_parameters
 from ballu_mjx.identification.fit_report import fit_table, intervals
 from ballu_mjx.identification.fit_robot import FitConfig, RobotFit, analyse, check_data, fit_robot, replay
 from ballu_mjx.identification.measured_motion import MeasuredMotion, SamplingConfig, measure
-from ballu_mjx.identification.parameters import Parameter, ParameterSet
+from ballu_mjx.identification.parameters import IdentifiedParameters, Parameter, ParameterSet
 from ballu_mjx.identification.window_objective import ReducedResiduals, robust_scatter, soften
 from ballu_mjx.identification.window_simulator import WindowSimulator, cut_windows
 from ballu_mjx.recordings.csv_format import read_recording
+from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.robots.description import RobotDescription
+from ballu_mjx.robots.model import FRICTION_ITERATIONS
 
 MODEL = """
 <mujoco>
@@ -152,6 +156,30 @@ def test_fit_names_a_torque_limit_that_no_recording_reaches(parameters: Paramete
 
 
 @pytest.mark.slow
+def test_windows_have_the_solver_iterations_of_models_with_identified_friction(tmp_path: Path):
+    """A single iteration does not determine which of two joints stick."""
+    friction = tuple({"joint": joint, "field": "frictionloss", "bounds": [0, 1]} for joint in ("shoulder", "elbow"))
+    description = dataclasses.replace(write_arm(tmp_path), identify=friction)
+    description.model.write_text(description.model.read_text().replace(' iterations="6"', ' iterations="1"'))
+    nominal, values, every = description.load_model(), np.array([0.6, 0.3]), 4
+    parameters = declared_parameters(description, nominal)
+    model = description.load_model(IdentifiedParameters(jnp.asarray(values), parameters))
+    assert (nominal.opt.iterations, model.opt.iterations) == (1, FRICTION_ITERATIONS)
+    model.opt.ls_iterations = 50  # C MuJoCo's line search needs more evaluations than ours
+    data, commands = mujoco.MjData(model), np.repeat(np.random.default_rng(0).uniform(-1, 1, (5, 2)), 40, axis=0)
+    states = [np.zeros(4)]
+    for command in commands:
+        data.ctrl[:] = command
+        mujoco.mj_step(model, data)
+        states.append(np.concatenate([data.qpos, data.qvel]))
+    qpos, qvel = np.split(np.array(states)[::every], 2, axis=1)
+    motion = MeasuredMotion("exact", nominal, every, commands, qpos, qpos, qvel, np.ones(2), np.ones(2))
+    with jax.enable_x64(True):
+        found = WindowSimulator(parameters, [motion], cut_windows([motion], 1.0)).differences(values)
+    assert np.abs(found).max() < 1e-6
+
+
+@pytest.mark.slow
 def test_derivatives_agree_with_finite_differences(motions: list[MeasuredMotion], parameters: ParameterSet):
     values = np.array([0.12, 0.08, 3.2, 0.36, 0.0333, 20.0])
     with jax.enable_x64(True):
@@ -262,6 +290,23 @@ WHEEL = """
   <actuator><motor name="motor" joint="axle" ctrlrange="-1 1"/></actuator>
 </mujoco>
 """
+
+
+@pytest.mark.parametrize(("rate", "rate_window"), [(100, 0.05), (25, 0.19), (100, 0.19)])
+def test_noise_of_velocities_is_at_least_the_noise_of_angles_that_their_filter_passes(
+    tmp_path: Path, rate: float, rate_window: float
+):
+    """With few samples per filter, the filters of full and of half the width are the same."""
+    robot = write_robot(tmp_path, "wheel", WHEEL, tracked="rim", commands={"wheel": "motor"}, joints=["axle"])
+    time, noise = np.arange(2000) / rate, 0.01
+    angle = 0.2 * np.sin(0.5 * time) + noise * np.random.default_rng(0).normal(size=len(time))
+    recording = Recording(
+        name="slow", kind="free", robot="wheel", time=time, command=np.zeros((2000, 1)), joint_angles={"axle": angle}
+    )
+    config = SamplingConfig(sample_timestep=1 / rate, angle_noise=noise, rate_window=rate_window)
+    found = measure(recording, robot, robot.load_model(), config)
+    errors = found.qvel[20:-20, 0] - 0.1 * np.cos(0.5 * time[20:-20])
+    assert 0.9 < found.velocity_noise[0] / np.std(errors) < 4
 
 
 def test_an_angle_that_counts_each_turn_from_0_is_the_same_motion(tmp_path: Path):

@@ -2,6 +2,7 @@
 
 import copy
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -13,8 +14,10 @@ from robot_files import write_robot
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.identification.body_deformation import BODY_QUANTITIES, deform_body
+from ballu_mjx.identification.bounded_solver import bounded_least_squares
 from ballu_mjx.identification.declarations import declared_parameters
 from ballu_mjx.identification.parameters import IdentifiedParameters, ParameterSet
+from ballu_mjx.identification.window_objective import ReducedResiduals, WindowSearch
 from ballu_mjx.robots.model import ModelParameters, set_fields
 from ballu_mjx.sim.drivetrain import identity_drivetrain
 
@@ -125,6 +128,20 @@ def test_tied_parameters_set_all_their_targets(tmp_path: Path):
     np.testing.assert_allclose(fields["jnt_stiffness"], [4.0, 6.0], rtol=1e-6)
 
 
+def test_centres_of_mass_of_mirrored_bodies_move_in_opposite_directions(tmp_path: Path):
+    targets = [{"body": "arm", "field": "com_y", "factor": 2}, {"body": "hand", "field": "com_y", "factor": -1}]
+    parameters, model = arm(tmp_path, {"targets": targets})
+    (tmp_path / "alone").mkdir()
+    alone, _ = arm(tmp_path / "alone", *({**target, "factor": 1} for target in targets))
+    with jax.enable_x64(True):
+        found, expected = (
+            np.asarray(declared.fields(model, np.array(values))["body_ipos"])
+            for declared, values in ((parameters, [0.01]), (alone, [0.02, -0.01]))
+        )
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+    np.testing.assert_allclose(2 * np.array(parameters.parameters[0].bounds), alone.parameters[0].bounds)
+
+
 def test_shares_0_and_1_are_the_bounds_of_a_parameter(tmp_path: Path):
     parameters, _ = arm(tmp_path, *EVERYTHING)
     for share, bound in ((0.0, parameters.lower), (1.0, parameters.upper)):
@@ -205,6 +222,29 @@ def test_identified_values_are_model_parameters(tmp_path: Path):
     assert parameters.slots(0.01) == 12
 
 
+def test_searches_from_all_starts_end_near_the_nominal_value_of_a_rate_limit_that_data_do_not_show(tmp_path: Path):
+    parameters, _ = arm(tmp_path, {"joint": "left", "field": "damping"}, {"command": "left", "field": "rate_limit"})
+    slopes = np.random.default_rng(0).normal(size=(3, 40, 2)) * [1e3, 0.0]
+
+    class Linear:
+        """Objective of data in which the damping is 0.3 and no command is limited."""
+
+        def __init__(self) -> None:
+            self.parameters = parameters
+
+        def __call__(self, values: np.ndarray, start: np.ndarray) -> tuple[ReducedResiduals, Any]:
+            residuals = slopes @ (values - [0.3, 0.0]) + 1.0
+            reduced = ReducedResiduals(residuals, slopes, start, np.zeros((3, 0, 2)))
+            return reduced, SimpleNamespace(values=residuals)
+
+    starts = parameters.shares(parameters.draw(0, 4))
+    assert np.ptp(starts[:, 1]) > 0.3
+    for begin in starts:
+        search: Any = WindowSearch(Linear(), np.zeros((3, 0)), None)  # pyright: ignore[reportArgumentType]
+        shares, _ = bounded_least_squares(search, begin, 20, lambda *_: None, 6)
+        np.testing.assert_allclose(parameters.at_shares(shares), [0.3, parameters.nominal[1]], rtol=0.02)
+
+
 FAULTS = {
     "no such joint": ({"joint": "knee", "field": "damping"}, "entry 1 names 'knee', which is no joint of the model"),
     "no such field": ({"joint": "left", "field": "colour"}, 'entry 1 has the field "colour"'),
@@ -228,6 +268,22 @@ FAULTS = {
     "no such key of a target": (
         {"targets": [{"joint": "left", "field": "damping", "facotr": 2}]},
         'a target with the key "facotr"',
+    ),
+    "a field beside targets": (
+        {"targets": [{"joint": "left", "field": "damping"}], "field": "damping"},
+        'has the key "field" beside "targets"',
+    ),
+    "a factor beside targets": (
+        {"targets": [{"joint": "left", "field": "damping"}], "factor": 2},
+        'has the key "factor" beside "targets"',
+    ),
+    "a factor of a mass": (
+        {"targets": [{"body": "arm", "field": "mass"}, {"body": "hand", "field": "mass", "factor": 2}]},
+        'has a "factor" of mass',
+    ),
+    "a body's mass tied to damping": (
+        {"targets": [{"body": "arm", "field": "mass"}, {"joint": "left", "field": "damping"}]},
+        "tie them to those of other bodies only",
     ),
     "bounds of ten": ({"body": "arm", "field": "mass_properties", "bounds": [0, 1]}, "leave it out"),
 }
