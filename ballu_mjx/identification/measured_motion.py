@@ -11,9 +11,8 @@ from jaxtyping import Float
 from scipy.signal import savgol_coeffs
 
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.recordings.filters import interpolate, mean_command, odd_window, savitzky_golay
+from ballu_mjx.recordings.filters import interpolate, mean_command, odd_window, savitzky_golay, unwound
 from ballu_mjx.recordings.motion import Motion, ReconstructionParameters
-from ballu_mjx.recordings.filters import unwound
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.robots.description import RobotDescription
 

@@ -44,7 +44,7 @@ def base(
     shift: float = 0.0,
 ) -> Path:
     """Write checkpoints with scores. Their networks differ, and depend on `shift`."""
-    config = describe_run("envmimic", SECTIONS, {}, [], None, ROBOT) | (residual or {"residual": None})
+    config = describe_run("envmimic", SECTIONS, {}, [], None, ROBOT) | dict(residual or {"residual": None})
     with Run(folder, config, resumed_at=resumed_at) as run:
         if resumed_at is None:
             TrainingRange.of(SEEN).write(run)
