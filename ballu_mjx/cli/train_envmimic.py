@@ -97,7 +97,7 @@ def train(data: Data, env: EnvMimicConfig, ppo: PPOConfig) -> int:
 def _base_residual(data: Data) -> ResidualReference | None:
     """Return the residual that acts beside the forces to be learned. None if there is none."""
     if data.resume is None:
-        return None if data.residual is None else ResidualReference(data.residual)
+        return ResidualReference.chosen(data.residual)
     if data.residual is not None:
         raise InputError("--residual does not go with --resume, which keeps the simulator; leave out one of them.")
     return run_residual(read_config(data.resume, "envmimic"), data.resume)

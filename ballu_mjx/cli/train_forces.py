@@ -101,8 +101,7 @@ def _train(
         env = settle(env, prepared)
         return {"env": env, "ppo": network, "fit": fit, "data": data}
 
-    base = None if data.residual is None else ResidualReference(data.residual)
-    return train_residual(task, data, sections, learn, show, base=base)
+    return train_residual(task, data, sections, learn, show, base=ResidualReference.chosen(data.residual))
 
 
 SUPERVISED = TrainCommand(

@@ -170,7 +170,7 @@ def _parts(task: Task, data: Data, robot: RobotDescription) -> tuple[ModelParame
                 )
         stored = read_config(data.resume, task.name)
         return run_actuators(stored, data.resume, robot), run_residual(stored, data.resume)
-    residual = None if data.residual is None else ResidualReference(data.residual)
+    residual = ResidualReference.chosen(data.residual)
     if data.actuators == NOMINAL:
         return None, residual
     if data.actuators != AUTO:

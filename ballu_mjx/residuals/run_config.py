@@ -89,6 +89,11 @@ class ResidualReference(NamedTuple):
     user: Path | None = None
     """The other run, for messages."""
 
+    @staticmethod
+    def chosen(folder: Path | None) -> ResidualReference | None:
+        """Return the best residual of the run that the user chose. None if there is none."""
+        return None if folder is None else ResidualReference(folder)
+
 
 def run_residual(config: Mapping[str, Any], folder: Path) -> ResidualReference | None:
     """Return the residual in a run's simulator. None if the simulator has no residual.

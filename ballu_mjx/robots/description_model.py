@@ -103,8 +103,8 @@ _ONE_DIRECTION = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SL
 def check_sites(path: Path, model: mujoco.MjModel, tracked: str, points: tuple[str, ...]) -> None:
     """Check the tracked site and the points.
 
-    **Raises** `InputError` if a site is missing, does not move, or belongs to another robot than the tracked site, and
-    if the model has a free joint that does not move the tracked site.
+    **Raises** `InputError` if a site is missing, does not move, or belongs to another robot than the tracked site. A
+    free joint that does not move the tracked site is refused, too.
     """
     linked, roots = linked_roots(model), []
     for key, site in (("tracked", tracked), *(("points", point) for point in points)):
