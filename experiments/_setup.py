@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -42,6 +43,27 @@ def parse(parser: argparse.ArgumentParser, output: Path, arguments: Sequence[str
     if options.output is None:
         options.output = quick if options.quick else output
     return options
+
+
+def reserve(folder: Path, **settings: object) -> None:
+    """Reserve a folder, whose finished results a later call takes over, for these settings of the experiment.
+
+    **Raises** `InputError` naming the differences if the folder has results of other settings, or of unknown ones.
+    """
+    from ballu_mjx.common.errors import InputError
+
+    path = folder / "settings.json"
+    if path.exists():
+        found = json.loads(path.read_text(encoding="utf-8"))
+        wanted = json.loads(json.dumps(settings))
+        other = [f"{name} {found.get(name)}" for name in wanted if wanted[name] != found.get(name)]
+        if other:
+            raise InputError(f"{folder} has results with {', '.join(other)}; choose another folder with --output.")
+    elif folder.is_dir() and any(folder.iterdir()):
+        raise InputError(f"{folder} has files but no {path.name}; choose another folder with --output.")
+    else:
+        folder.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(settings, indent=2) + "\n", encoding="utf-8")
 
 
 def write_table(text: str, folder: Path) -> None:

@@ -171,6 +171,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="two rows, trained for seconds; the numbers mean nothing")
     parser.add_argument("--results", type=Path, help="JSON file to write the table to")
     options = _setup.parse(parser, Path("runs/ablation"))
+    _setup.reserve(options.output, steps=options.steps, fresh=options.fresh, quick=options.quick)
 
     training = list_bundled("training")
     rows, seeds, sizes = options.rows, options.seeds, Sizes(options.steps, 200_000, {})
@@ -191,7 +192,6 @@ def main() -> None:
         ]
         for use, paths in read.items()
     }
-    options.output.mkdir(parents=True, exist_ok=True)
     results: dict[str, list[list[dict[str, Any]]]] = {}
     for seed in seeds:
         for label in rows:

@@ -105,6 +105,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="use one test gait; the numbers mean little")
     parser.add_argument("--results", type=Path, help="JSON file to write the tables to")
     options = _setup.parse(parser, Path("runs/deflation"))
+    _setup.reserve(options.output, quick=options.quick)
 
     air = options.air
     if air is None:

@@ -402,6 +402,13 @@ def learn(
 
 def main() -> None:
     options = parse()
+    _setup.reserve(
+        options.output,
+        robot=options.robot,
+        robot_family=options.robot_family,
+        fresh=options.fresh,
+        quick=options.quick,
+    )
     recorded = record(options.hardware, options.output)
     methods = without_known_delay(options.methods, recorded.actuators)
     if left_out := [METHODS[name].label for name in options.methods if name not in methods]:

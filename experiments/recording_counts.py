@@ -124,6 +124,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="learn for seconds; the numbers mean nothing")
     parser.add_argument("--results", type=Path, help="JSON file to write the table to")
     arguments = _setup.parse(parser, Path("runs/recording_counts"))
+    _setup.reserve(arguments.output, quick=arguments.quick)
     if arguments.quick:
         arguments.counts, arguments.seeds = arguments.counts[:2], arguments.seeds[:1]
     found = learn(arguments)

@@ -18,6 +18,7 @@ from experiment_modules import EXPERIMENTS, experiment_module
 from ballu_mjx.ballu.actuators import ActuatorParameters
 from ballu_mjx.ballu.actuators_file import actuators_to_json
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model
+from ballu_mjx.common.errors import InputError
 from ballu_mjx.identification.actuators import ACTUATORS_FILE
 from ballu_mjx.recordings.csv_format import list_bundled
 from ballu_mjx.residuals.aerodynamics import Aerodynamics
@@ -81,6 +82,18 @@ def test_these_tests_cover_every_experiment_with_quick_runs():
 def test_a_given_folder_is_used(fidelity: ModuleType, given: list[str], folder: str, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(sys, "argv", ["fidelity.py", *given])
     assert fidelity.parse().output == Path(folder)
+
+
+def test_results_of_other_settings_are_not_taken_over(tmp_path: Path):
+    with experiment_module(EXPERIMENTS / "_setup.py") as setup:
+        setup.reserve(tmp_path / "new", steps=3, robot="a")
+        setup.reserve(tmp_path / "new", steps=3, robot="a")
+        with pytest.raises(InputError, match="results with steps 3; choose another folder with --output"):
+            setup.reserve(tmp_path / "new", steps=4, robot="a")
+        (tmp_path / "old").mkdir()
+        (tmp_path / "old" / "00-seed-0.json").touch()
+        with pytest.raises(InputError, match="has files but no settings.json"):
+            setup.reserve(tmp_path / "old", steps=3, robot="a")
 
 
 def test_methods_that_identify_a_known_delay_are_left_out(fidelity: ModuleType, tmp_path: Path):

@@ -188,7 +188,7 @@ def _train_declared(
         )
         stages.close()
         run.write("identification.txt", found.report + "\n")
-        run.write(IDENTIFICATION_FILE, json.dumps(found.details, indent=2) + "\n")
+        run.write(IDENTIFICATION_FILE, json.dumps(found.details, indent=2, allow_nan=False) + "\n")
         run.write(ACTUATORS_FILE, _actuators_json(robot, found, paths))
         _draw(folder, found)
         print(f"\n{found.report}\n")

@@ -6,6 +6,7 @@ import contextlib
 import errno
 import gzip
 import json
+import math
 import os
 import tempfile
 import zlib
@@ -76,6 +77,11 @@ def parse_json(text: str, where: str, fix: str) -> Any:
             raise InputError(f"{where}: not JSON (line {error.lineno}: {error.msg}); {fix}.") from error
         raise InputError(f"{where}: not JSON that this program can read ({type(error).__name__}); {fix}.") from error
     return content
+
+
+def finite_or_none(value: float) -> float | None:
+    """Return a number as JSON can express it: None if it is infinite or not a number."""
+    return value if math.isfinite(value) else None
 
 
 def write(path: Path, content: str | bytes) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError, is_number
+from ballu_mjx.common.files import finite_or_none
 from ballu_mjx.evaluation.errors import LARGEST, WHOLE, Angle, Errors, Evaluation
 from ballu_mjx.recordings.recording_groups import group_of
 from ballu_mjx.robots.description_fields import HORIZON_RANGE
@@ -24,8 +25,8 @@ def evaluation_to_json(evaluation: Evaluation) -> dict[str, Any]:
         "base": evaluation.base,
         "name": evaluation.name,
         "angle": evaluation.angle,
-        "score": _finite(evaluation.score),
-        "worst_beyond_bound": {"relative": _finite(worst), "where": place},
+        "score": finite_or_none(evaluation.score),
+        "worst_beyond_bound": {"relative": finite_or_none(worst), "where": place},
         "nominal": [_errors_to_json(errors) for errors in evaluation.nominal],
         "vanilla": [_errors_to_json(errors) for errors in evaluation.vanilla],
         "residual": [_errors_to_json(errors) for errors in evaluation.residual],
@@ -35,13 +36,9 @@ def evaluation_to_json(evaluation: Evaluation) -> dict[str, Any]:
 def _errors_to_json(errors: Errors) -> dict[str, Any]:
     found = dataclasses.asdict(errors)
     for quantity in ("position", "orientation", "points", "joints"):
-        found[quantity] = {horizon: [_finite(x) for x in pair] for horizon, pair in found[quantity].items()}
-    found["medians"] = {name: {h: _finite(x) for h, x in each.items()} for name, each in errors.medians.items()}
-    return found | {name: _finite(found[name]) for name in WHOLE}
-
-
-def _finite(value: float | int) -> float | int | None:
-    return value if np.isfinite(value) else None
+        found[quantity] = {horizon: [finite_or_none(x) for x in pair] for horizon, pair in found[quantity].items()}
+    found["medians"] = {name: {h: finite_or_none(x) for h, x in each.items()} for name, each in errors.medians.items()}
+    return found | {name: finite_or_none(found[name]) for name in WHOLE}
 
 
 def evaluation_from_json(content: Mapping[str, Any]) -> Evaluation:

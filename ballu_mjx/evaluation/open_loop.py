@@ -185,11 +185,12 @@ class OpenLoopEvaluator:
         longest = max(len(motion.command) for motion in self.motions) * self.robot.control_timestep
         self.horizons = choose_horizons(self.robot.horizons, longest)
         interval = round(min(START_INTERVAL, *self.horizons) / self.robot.control_timestep)
+        shortest = HISTORY - 1 + round(min(self.horizons) / self.robot.control_timestep)
         for motion in self.motions:
-            if len(motion.command) < HISTORY - 1 + interval:
+            if len(motion.command) < shortest:
                 raise InputError(
-                    f"{motion.name}: has {len(motion.command)} control steps, which are too few for a replay; give a "
-                    f"recording with {HISTORY - 1 + interval} or more."
+                    f"{motion.name}: has {len(motion.command)} control steps, but a replay over the shortest horizon "
+                    f"({min(self.horizons):g} s) needs {shortest}; give a longer recording."
                 )
         reference, com = stack_motions(self._simulator, motions)
         self._recorded, self._recorded_com = np.asarray(reference.features), np.asarray(com)

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.stats import t as student
 
+from ballu_mjx.common.files import finite_or_none
 from ballu_mjx.identification.fit_robot import HeldOut, RobotFit
 
 
@@ -129,14 +130,18 @@ def _held_out_table(fit: RobotFit, model: mujoco.MjModel, window_seconds: float,
 
 
 def fit_details(fit: RobotFit, model: mujoco.MjModel) -> dict[str, Any]:
-    """Return a fit as JSON types: parameters with intervals, undetermined combinations, errors on held-out windows."""
+    """Return a fit as JSON types: parameters with intervals, undetermined combinations, errors on held-out windows.
+
+    An infinite number is None: the nominal value of a rate limit that the model lacks, or the error of windows most of
+    which diverged.
+    """
     rows = []
     for place, (one, (low, high)) in enumerate(zip(fit.parameters.parameters, intervals(fit), strict=True)):
         rows.append(
             {
                 "name": one.name,
                 "unit": one.unit,
-                "nominal": one.nominal,
+                "nominal": finite_or_none(one.nominal),
                 "expected": float(fit.parameters.expected[place]),
                 "value": float(fit.values[place]),
                 "standard_error": float(fit.standard_errors[place]),
@@ -164,5 +169,6 @@ def _by_values(fit: RobotFit) -> Mapping[str, HeldOut]:
 
 
 def _held_out(found: HeldOut, model: mujoco.MjModel) -> dict[str, Any]:
-    final = dict(zip(channel_names(model), map(float, found.final_median[: model.nv]), strict=True))
-    return {"score": found.score, "windows": len(found.motion), "final_median": final}
+    medians = (finite_or_none(float(x)) for x in found.final_median[: model.nv])
+    final = dict(zip(channel_names(model), medians, strict=True))
+    return {"score": finite_or_none(found.score), "windows": len(found.motion), "final_median": final}

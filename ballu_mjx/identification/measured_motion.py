@@ -7,7 +7,7 @@ from functools import partial
 
 import mujoco
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.signal import savgol_coeffs
 
 from ballu_mjx.common.errors import InputError
@@ -35,7 +35,9 @@ class SamplingConfig:
     sample_timestep: float = 0.02
     """Time between two compared samples (s), rounded to physics steps."""
     angle_noise: float = float(np.deg2rad(0.3))
-    """Standard deviation of a recorded joint coordinate (rad for a hinge, m for a slide)."""
+    """Standard deviation of a recorded joint angle (rad)."""
+    slide_noise: float = 5e-4
+    """Standard deviation of a recorded displacement of a slide (m)."""
     position_window: float = 0.09
     """Width of the Savitzky-Golay filter for starting positions (s)."""
     rate_window: float = 0.19
@@ -107,7 +109,8 @@ def measure(
     filtered = partial(savitzky_golay, angles, step=sample / fine, order=config.order)
     rates, narrow = (filtered(width, derivative=1) for width in (config.rate_window, config.rate_window / 2))
     window = odd_window(config.rate_window, sample / fine, config.order, len(grid))
-    passed = config.angle_noise * np.linalg.norm(savgol_coeffs(window, config.order, deriv=1, delta=sample / fine))
+    noise = np.where(_slides(model), config.slide_noise, config.angle_noise)
+    passed = noise * np.linalg.norm(savgol_coeffs(window, config.order, deriv=1, delta=sample / fine))
     uncertainty = np.hypot(np.std(rates - narrow, axis=0), _SURE * np.std(rates, axis=0) + 1e-6)
     # A semi-implicit integrator's velocity is the mean over the time step that led to the position.
     rates = rates - np.gradient(rates, sample / fine, axis=0) * timestep / 2
@@ -120,9 +123,14 @@ def measure(
         qpos=angles[here],
         start_qpos=filtered(config.position_window, derivative=0)[here],
         qvel=rates[here],
-        position_noise=np.full(model.nv, config.angle_noise),
+        position_noise=noise,
         velocity_noise=np.maximum(uncertainty, passed),
     )
+
+
+def _slides(model: mujoco.MjModel) -> Bool[np.ndarray, " nv"]:
+    """Return which velocities belong to slides."""
+    return model.jnt_type[model.dof_jntid] == mujoco.mjtJoint.mjJNT_SLIDE
 
 
 def held_motion(
@@ -181,6 +189,6 @@ def measured_from_motion(
         qpos=motion.qpos,
         start_qpos=motion.qpos,
         qvel=motion.qvel,
-        position_noise=positions[kinds],
+        position_noise=np.where(_slides(model), parameters.position_noise, positions[kinds]),
         velocity_noise=np.array(velocity_noise)[kinds],
     )

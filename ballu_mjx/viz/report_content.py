@@ -212,19 +212,25 @@ def _add_identification(content: Content, folder: Path) -> None:
             low, high = each["interval"]
             notes = ["not shown"] * (not each["seen"]) + ["at a bound"] * bool(each["at_bound"])
             numbers = [each[key] for key in ("nominal", "value", "standard_error", "white_noise_error")]
-            cells = [Cell(f"{x:.4g}", repr(x)) for x in (*numbers, low, high)]
+            cells = [_number(x, 4, "none") for x in (*numbers, low, high)]
             rows.append([Cell(str(each["name"])), *cells, Cell(str(each["unit"])), Cell(", ".join(notes))])
         header = ["", "nominal", "identified", "standard error", "of white noise", "95 % from", "to", "unit", ""]
         content.tables.append(Table("parameters", header, rows))
         pair = [found["held_out"][name] for name in ("nominal", "identified")]
-        rows = [[Cell("all, in units of noise"), *(Cell(f"{each['score']:.3g}", repr(each["score"])) for each in pair)]]
+        rows = [[Cell("all, in units of noise"), *(_number(each["score"], 3, "diverged") for each in pair)]]
         for name in pair[0]["final_median"]:
             values = [each["final_median"][name] for each in pair]
-            rows.append([Cell(f"{name}, median at the end (rad or m)"), *(Cell(f"{x:.4g}", repr(x)) for x in values)])
+            cells = [_number(x, 4, "diverged") for x in values]
+            rows.append([Cell(f"{name}, median at the end (rad or m)"), *cells])
         title = f"errors on {pair[0]['windows']} held-out windows"
         content.tables.append(Table(title, ["", "nominal", "identified"], rows))
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: is damaged ({error!r}); run the identification again.") from None
+
+
+def _number(value: float | None, digits: int, otherwise: str) -> Cell:
+    """Return a cell with a number to some significant digits, or with the text `otherwise` if it is None."""
+    return Cell(otherwise) if value is None else Cell(f"{value:.{digits}g}", repr(value))
 
 
 def _horizons(title: str, names: tuple[str, str], without: Errors, mimic: Errors, angle: str) -> Table:

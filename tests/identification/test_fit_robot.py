@@ -15,7 +15,7 @@ from servo_arm import write_arm
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.identification.declarations import declared_parameters
-from ballu_mjx.identification.fit_report import fit_table, intervals
+from ballu_mjx.identification.fit_report import fit_details, fit_table, intervals
 from ballu_mjx.identification.fit_robot import FitConfig, RobotFit, analyse, check_data, fit_robot, replay
 from ballu_mjx.identification.measured_motion import MeasuredMotion, SamplingConfig, measure
 from ballu_mjx.identification.parameters import IdentifiedParameters, Parameter, ParameterSet
@@ -25,6 +25,8 @@ from ballu_mjx.recordings.csv_format import read_recording
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import FRICTION_ITERATIONS
+from ballu_mjx.runs.layout import RUN_FORMAT
+from ballu_mjx.viz.report_content import collect
 
 MODEL = """
 <mujoco>
@@ -138,6 +140,19 @@ def test_report_warns_of_held_out_errors_far_above_the_noise(fit: RobotFit, tmp_
     lacking = dataclasses.replace(fit, identified=fit.nominal)
     assert lacking.identified.score > 2
     assert doubt in fit_table(lacking, model, 1.0, "validation recordings")
+
+
+def test_errors_of_diverged_windows_are_null_in_the_file_and_named_in_the_report(fit: RobotFit, tmp_path: Path):
+    lost = dataclasses.replace(fit.nominal, errors=np.full_like(fit.nominal.errors, np.nan))
+    details = fit_details(dataclasses.replace(fit, nominal=lost), robot(tmp_path)[2])
+    text = json.dumps(details, allow_nan=False)
+    assert details["held_out"]["nominal"]["score"] is None
+    assert set(details["held_out"]["nominal"]["final_median"].values()) == {None}
+    (tmp_path / "config.json").write_text(json.dumps({"format": RUN_FORMAT, "task": "sysid"}))
+    (tmp_path / "identification.json").write_text(text)
+    rows = collect(tmp_path).tables[-1].rows
+    assert [row[1].text for row in rows] == ["diverged"] * len(rows)
+    assert all(float(row[2].exact or "nan") < 1 for row in rows[1:])
 
 
 def test_identified_parameters_worse_than_nominal_are_not_chosen(fit: RobotFit):

@@ -8,7 +8,7 @@ import numpy as np
 from ballu_mjx.identification.measured_motion import measured_from_motion
 from ballu_mjx.identification.parameters import FieldTarget, Parameter, ParameterSet
 from ballu_mjx.identification.window_simulator import WindowSimulator, cut_windows
-from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.recordings.motion import Motion, ReconstructionParameters
 
 MODEL = """
 <mujoco>
@@ -60,6 +60,19 @@ def test_windows_follow_the_recording_and_their_starting_states_may_be_moved():
         start[:, [1, 4, 6, 9, 12]] = [1.0, 2.0, -1.0, 0.5, 0.3]
         moved = simulator.differences(true, start)
         np.testing.assert_allclose(moved[:, 0], start, atol=1e-3)  # in units of the noise
+
+
+def test_a_slide_has_the_noise_of_a_displacement_and_a_hinge_that_of_an_angle():
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><body><freejoint/><geom size="0.05" mass="0.3"/>
+        <body><joint type="slide"/><geom size="0.05" mass="0.1"/></body>
+        <body><joint type="hinge"/><geom size="0.05" mass="0.1"/></body></body></worldbody></mujoco>"""
+    )
+    still = np.tile(model.qpos0, (5, 1))
+    motion = Motion("still", np.arange(5) * 0.02, np.zeros((4, 0)), still, np.zeros((5, model.nv)), {})
+    parameters = ReconstructionParameters(position_noise=0.001, rotation_noise=0.02, joint_noise=0.03)
+    noise = measured_from_motion(motion, model, parameters).position_noise
+    np.testing.assert_allclose(noise, [0.001] * 3 + [0.02] * 3 + [0.001, 0.03])
 
 
 def test_difference_of_positions_inverts_a_change_of_position():

@@ -65,6 +65,17 @@ def test_encoder_that_restarts_each_turn_is_interpolated_over_its_restarts(tmp_p
     np.testing.assert_allclose(found.columns["wheel"][1:-1], 8.0 * TIME[1:-1], atol=1e-9)
 
 
+def test_a_gap_of_another_clock_is_left_open_up_to_the_samples_at_its_ends(tmp_path: Path):
+    angle, late = 0.1 * TIME, np.append(TIME[:-1], TIME[-1] + 0.001)  # equal times but for the last one
+    first, last = len(TIME) // 4, len(TIME) // 2
+    angle[first + 1 : last] = np.nan
+    found = select(
+        capture(encoder=Series(angle, late, si=True)), room(tmp_path, BODIES + '[wheel]\ncolumn = "encoder"\n')
+    ).columns["wheel"]
+    np.testing.assert_array_equal(np.flatnonzero(np.isnan(found)), np.arange(first + 1, last))
+    np.testing.assert_allclose(found[[first, last]], 0.1 * TIME[[first, last]])
+
+
 @pytest.mark.parametrize("rotation", ["quaternion", "XYZ", "helical"])
 def test_orientation_columns_with_their_own_clock_are_interpolated_along_the_shortest_rotation(
     tmp_path: Path, rotation: str

@@ -348,6 +348,11 @@ def test_log_replaces_the_commands_of_the_capture(tmp_path: Path, robot: RobotDe
     [
         (write_bag, 'arm = "/cmd:data[0]"\npush = "/cmd:data[1]"\n', 'write time = "received" under [commands] in'),
         (
+            write_bag,
+            'time = "recieved"\narm = "/cmd:data[0]"\npush = "/cmd:data[1]"\n',
+            "[commands] time: a bag has no column 'recieved'; write \"header\"",
+        ),
+        (
             lambda folder: write_lerobot(folder, episodes=2),
             'time = "timestamp"\narm = "action[0]"\npush = "action[1]"\n',
             "holds 2 episodes, 0 to 1; give the commands of one episode as a table",

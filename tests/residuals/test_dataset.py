@@ -89,19 +89,33 @@ def test_recordings_contain_the_longest_horizon_after_the_first_start(timestep: 
                 check_recording(THREE, short, robot, long_enough=True)
 
 
-def test_a_motion_without_a_start_is_refused() -> None:
-    model = load_robot().load_model()
-    steps = HISTORY + 10  # less than the second between two starts
+@pytest.mark.parametrize(
+    ("horizons", "steps", "words"),
+    [
+        ((), HISTORY + 10, "has 13 control steps.*shortest horizon .1 s. needs 22"),
+        ((1.5, 0.5), HISTORY + 10, None),
+        ((1.5,), HISTORY + 28, "has 31 control steps.*shortest horizon .1.5 s. needs 32"),
+        ((1.5,), HISTORY + 29, None),
+    ],
+)
+def test_a_motion_shorter_than_the_shortest_horizon_is_refused(
+    horizons: tuple[float, ...], steps: int, words: str | None
+) -> None:
+    robot = dataclasses.replace(load_robot(), horizons=horizons)
+    model = robot.load_model()
     qpos, command = np.tile(model.qpos0, (steps + 1, 1)), np.zeros((steps, 2))
     motion = Motion("blink", np.arange(steps + 1) * 0.05, command, qpos, np.zeros((steps + 1, model.nv)), {})
-    simulator = Simulator(load_robot())
+    simulator = Simulator(robot)
     long = dataclasses.replace(
         motion, name="long", time=np.arange(41) * 0.05, command=np.zeros((40, 2)), qpos=np.tile(model.qpos0, (41, 1)),
         qvel=np.zeros((41, model.nv)),
     )  # fmt: skip
-    residual = Aerodynamics(load_robot(), simulator.mj_model)
-    with pytest.raises(InputError, match="blink: has 13 control steps.*give a recording with 22 or more"):
+    residual = Aerodynamics(robot, simulator.mj_model)
+    if words is None:
         OpenLoopEvaluator(simulator, [long, motion], residual)
+    else:
+        with pytest.raises(InputError, match=f"blink: {words}"):
+            OpenLoopEvaluator(simulator, [long, motion], residual)
 
 
 def test_bundled_recordings_of_different_uses_do_not_overlap() -> None:

@@ -80,7 +80,7 @@ def open_bag(path: Path, mapping: RoomMapping | None) -> Capture:
     clock = Clock(_EITHER) if mapping is None else mapping.clock
     if mapping is not None and clock.time not in (None, HEADER, RECEIVED):
         fix = f'write "{HEADER}" (stamps of the messages) or "{RECEIVED}" (times of recording)'
-        refuse(mapping.path, "[clock] time", f"a bag has no column {shorten(clock.time)!r}", fix)
+        refuse(mapping.path, f"{clock.table} time", f"a bag has no column {shorten(clock.time)!r}", fix)
     length = 1.0 if mapping is None or mapping.length is None else LENGTHS[mapping.length]
     topics = _mcap_topics(path) if path.suffix.lower() == ".mcap" else _bag_topics(path)
     bodies: dict[str, Callable[[], Stream]] = {}

@@ -473,8 +473,8 @@ def _rotations_on_clock(
 
 
 def _bridged(own: np.ndarray, seen: np.ndarray, time: np.ndarray) -> np.ndarray:
-    """Return which of `time` lie between two seen samples, with a gap of at most `_LONGEST_BRIDGE` spacings and
-    `LONGEST_GAP`."""
+    """Return which of `time` are times of seen samples, or lie between two with a gap of at most `_LONGEST_BRIDGE`
+    spacings and `LONGEST_GAP`."""
     if len(seen) < 2:
         return np.zeros(len(time), bool)
     known = own[seen]
@@ -482,4 +482,5 @@ def _bridged(own: np.ndarray, seen: np.ndarray, time: np.ndarray) -> np.ndarray:
     step = known[after] - known[after - 1]
     spacing = max(float(np.median(np.diff(own))), float(np.median(np.diff(time))))
     longest = min(_LONGEST_BRIDGE * spacing, LONGEST_GAP)
-    return (time >= known[0] - 1e-9) & (time <= known[-1] + 1e-9) & (step <= longest)
+    bridged = (step <= longest) | (known[after] - time <= 1e-9)  # or at the sample that ends a gap
+    return (time >= known[0] - 1e-9) & (time <= known[-1] + 1e-9) & bridged

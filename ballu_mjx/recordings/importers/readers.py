@@ -12,7 +12,7 @@ from ballu_mjx.recordings.importers.bags import open_bag, recognise_bag
 from ballu_mjx.recordings.importers.c3d import list_c3d, read_c3d, recognise_c3d
 from ballu_mjx.recordings.importers.capture import Capture, list_capture, select
 from ballu_mjx.recordings.importers.contents import Contents
-from ballu_mjx.recordings.importers.mapping import RoomMapping
+from ballu_mjx.recordings.importers.mapping import Commands, RoomMapping
 from ballu_mjx.recordings.importers.motive import open_motive, recognise_motive
 from ballu_mjx.recordings.importers.pose_files import open_euroc, open_tum, recognise_euroc, recognise_tum
 from ballu_mjx.recordings.importers.qualisys import open_qualisys, recognise_qualisys
@@ -145,6 +145,6 @@ def open_log(path: Path, mapping: RoomMapping) -> Capture:
     if reader.open is None or reader.name in ("motive", "qualisys", "euroc", "tum"):
         raise InputError(f"{path}: a {reader.program} holds no commands; give them as a table, an archive or a bag.")
     # [clock] is for the capture. The clock of the log is under [commands].
-    own = mapping.commands.time if reader.name == "bag" and mapping.commands.time in ("header", "received") else None
+    own = mapping.commands.time if reader.name == "bag" and mapping.commands.time != Commands.time else None
     clock = dataclasses.replace(mapping.clock, time=own, log=True)
     return reader.open(path, dataclasses.replace(mapping, clock=clock))

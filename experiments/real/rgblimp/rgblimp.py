@@ -406,6 +406,7 @@ def main() -> None:
     parser.add_argument("--results", type=Path, help="JSON file to write the tables to")
     parser.add_argument("--figure", type=Path, help="PNG file for a figure of three test flights")
     options = _setup.parse(parser, Path("runs/rgblimp"))
+    _setup.reserve(options.output, data=str(options.data.resolve()), quick=options.quick)
     robot = read_description(DESCRIPTION)
     few = slice(0, 2) if options.quick else slice(None)
     files = {
