@@ -415,15 +415,23 @@ def _difference(one: Sequence[float], other: Sequence[float], form: str) -> Cell
 
 
 def write_tables(drawn: Mapping[str, Any], units: Path, output: Path) -> list[Path]:
-    """Write the tables of each kind whose units are all measured, and return the files."""
+    """Write the tables of each kind that was measured on all robots, and return the files.
+
+    The tables of policies are over the first training seeds, as many as were measured on all robots. Their caption
+    names them.
+    """
     written = []
     for kind in KINDS:
         mine = [unit for unit in all_units() if unit.kind == kind]
-        paths = [units / f"{unit.name}.json" for unit in mine]
-        if missing := [path.name for path in paths if not path.exists()]:
-            print(f"{kind}: {len(missing)} of {len(paths)} units are missing, so that it has no tables yet.")
+        paths = {unit: units / f"{unit.name}.json" for unit in mine}
+        missing = [unit for unit in mine if not paths[unit].exists()]
+        first = min((unit.training or 0 for unit in missing), default=TRAININGS)
+        if missing:
+            print(f"{kind}: {len(missing)} of {len(mine)} units are missing.")
+        if first == 0:
             continue
-        read = [read_unit(path, drawn) for path in paths]
+        mine = [unit for unit in mine if (unit.training or 0) < first]
+        read = [read_unit(paths[unit], drawn) for unit in mine]
         if kind == "fidelity":
             tables = fidelity_tables([each["result"] for each in read])
         else:
@@ -434,7 +442,9 @@ def write_tables(drawn: Mapping[str, Any], units: Path, output: Path) -> list[Pa
         machine = read[0]["machine"] | {"cpu": " and ".join(sorted({each["machine"]["cpu"] for each in read}))}
         measured = {"commit": drawn["commit"], "machine": machine, "versions": read[0]["versions"]}
         data = f"Final tier, tag {drawn['tag']}: brackets are {LEVEL:.0%} intervals over {len(ROBOTS)} robots"
-        seeds = {"training": drawn["seeds"]["trainings"][:TRAININGS]}
+        if missing:
+            data += f", the first {first} of {TRAININGS} training seeds"
+        seeds = {"training": drawn["seeds"]["trainings"][:first]}
         seeds |= {"own robot": drawn["seeds"]["robots"], "PyBullet robot": drawn["seeds"]["robots_outside"]}
         written.append(output / f"final_{kind}.json")
         write_results(written[-1], tables, data, seeds=seeds, measured=measured)

@@ -148,19 +148,26 @@ def test_seeds_that_do_not_follow_from_the_commit_are_refused(final_tier: Module
         final_tier.read_seeds(path)
 
 
-def test_tables_are_written_only_for_complete_kinds(
+def test_tables_are_of_the_first_training_seeds_that_all_robots_have(
     final_tier: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     drawn = {**DRAWN, "seeds": final_tier.draw_seeds(DRAWN["commit"])}
     for unit in final_tier.all_units():
-        if unit.kind == "walk" or (unit.kind == "turn" and unit.robot < 4):
-            final_tier.write_unit(tmp_path / f"{unit.name}.json", unit, drawn, 1.0, policies(1.0, 2.0, 0.1))
-    assert final_tier.write_tables(drawn, tmp_path, tmp_path) == [tmp_path / "final_walk.json"]
+        measured = {"fidelity": unit.robot < 4, "walk": True, "turn": unit.training == 0 or unit.robot < 4}
+        if measured[unit.kind]:
+            result = policies(9.0 if unit.training else 1.0, 2.0, 0.1)
+            final_tier.write_unit(tmp_path / f"{unit.name}.json", unit, drawn, 1.0, result)
+    files = [tmp_path / "final_walk.json", tmp_path / "final_turn.json"]
+    assert final_tier.write_tables(drawn, tmp_path, tmp_path) == files
     said = capsys.readouterr().out
-    assert "fidelity: 5 of 5 units are missing" in said and "turn: 3 of 15 units are missing" in said
-    written = read_results(tmp_path / "final_walk.json")
-    assert written.commit == DRAWN["commit"] and written.seeds["training"] == drawn["seeds"]["trainings"][:3]
-    assert written.data.startswith("Final tier, tag final-1")
+    assert "fidelity: 1 of 5 units are missing" in said and "turn: 2 of 15 units are missing" in said
+    walk, turn = map(read_results, files)
+    assert walk.commit == DRAWN["commit"] and walk.seeds["training"] == drawn["seeds"]["trainings"][:3]
+    assert walk.data.startswith("Final tier, tag final-1") and "first" not in walk.data
+    assert turn.seeds["training"] == drawn["seeds"]["trainings"][:1]
+    assert turn.data.endswith("the first 1 of 3 training seeds")
+    for row in turn.tables["robots"].rows:
+        assert numbers(row[-1]) in ([pytest.approx(1.0)], [pytest.approx(2.0)])  # the first training's alone
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "results" / "final").glob("*.json")), ids=lambda path: path.name)
