@@ -44,7 +44,7 @@ from ballu_mjx.policies.policy import environment_of
 from ballu_mjx.policies.tasks import find_task
 from ballu_mjx.policies.training import locomotion_ppo
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording
-from ballu_mjx.recordings.reconstruct import reconstruct
+from ballu_mjx.recordings.reconstruct import reconstruct_for_simulator
 from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv
 from ballu_mjx.rl import learner, ppo, training_env, training_state
 from ballu_mjx.robots.registry import load_robot
@@ -119,8 +119,7 @@ def make_environment(kind: str, simulator: Simulator) -> tuple[EnvMimicEnv | Loc
     if kind == "walk":
         return environment_of(robot, find_task("walk"), LocomotionConfig(), simulator.actuators), locomotion_ppo()
     recordings = [read_recording(path, robot) for path in list_bundled("training")]
-    drivetrain = simulator.drivetrain
-    motions = [reconstruct(recording, robot, simulator.mj_model, drivetrain=drivetrain) for recording in recordings]
+    motions = [reconstruct_for_simulator(recording, simulator) for recording in recordings]
     return EnvMimicEnv(simulator, motions, EnvMimicConfig()), ppo.PPOConfig()
 
 

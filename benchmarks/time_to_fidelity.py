@@ -116,7 +116,7 @@ def vanilla_ratio(folder: str) -> float:
     from ballu_mjx.evaluation.errors import Evaluation
     from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
     from ballu_mjx.recordings.csv_format import read_recording
-    from ballu_mjx.recordings.reconstruct import reconstruct
+    from ballu_mjx.recordings.reconstruct import reconstruct_for_simulator
     from ballu_mjx.residuals.run_config import find_recordings
     from ballu_mjx.residuals.trained_residual import TrainedResidual
     from ballu_mjx.robots.registry import load_robot
@@ -130,7 +130,7 @@ def vanilla_ratio(folder: str) -> float:
     recordings = [read_recording(each, robot) for each in paths]
 
     def evaluate(simulator: Simulator) -> Evaluation:
-        motions = [reconstruct(each, load_robot(), simulator.mj_model) for each in recordings]
+        motions = [reconstruct_for_simulator(each, simulator) for each in recordings]
         return OpenLoopEvaluator(simulator, motions, trained.model)(trained.params)
 
     best = evaluate(Simulator(robot, trained.actuators))

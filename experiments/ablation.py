@@ -37,7 +37,7 @@ from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
 from ballu_mjx.identification.actuators import ACTUATORS_FILE
 from ballu_mjx.recordings.csv_format import list_bundled, read_recording
 from ballu_mjx.recordings.motion import Motion
-from ballu_mjx.recordings.reconstruct import reconstruct
+from ballu_mjx.recordings.reconstruct import reconstruct_for_simulator
 from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv
 from ballu_mjx.residuals.network import NetworkResidual
 from ballu_mjx.residuals.presets import preset_values
@@ -184,12 +184,7 @@ def main() -> None:
     simulator = Simulator(load_robot(), identified)
     read = {"training": training, "validation": validation}
     motions = {
-        use: [
-            reconstruct(
-                read_recording(path, load_robot()), load_robot(), simulator.mj_model, drivetrain=simulator.drivetrain
-            )
-            for path in paths
-        ]
+        use: [reconstruct_for_simulator(read_recording(path, load_robot()), simulator) for path in paths]
         for use, paths in read.items()
     }
     results: dict[str, list[list[dict[str, Any]]]] = {}

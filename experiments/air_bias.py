@@ -26,14 +26,14 @@ import deflation
 import numpy as np
 
 from ballu_mjx.ballu.actuators_file import read_actuators
-from ballu_mjx.ballu.model import buoyancy_ratio, load_model
+from ballu_mjx.ballu.model import buoyancy_ratio
 from ballu_mjx.ballu.virtual import dataset
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.ballu.virtual.robot import VirtualRobot
 from ballu_mjx.cli import train_aerodynamics
 from ballu_mjx.common.results import Cell, Table
 from ballu_mjx.identification.actuators import ACTUATORS_FILE
-from ballu_mjx.recordings.reconstruct import reconstruct
+from ballu_mjx.recordings.reconstruct import reconstruct_for_simulator
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, AirFit, identify_air
 from ballu_mjx.robots.model import assets
 from ballu_mjx.robots.registry import load_robot
@@ -132,7 +132,7 @@ def main() -> None:
     parser.add_argument("--results", type=Path, help="JSON file to write the tables to")
     options = _setup.parse(parser, Path("runs/air-bias"))
 
-    model = load_model(read_actuators(assets() / "recordings" / ACTUATORS_FILE)[1])
+    simulator = Simulator(load_robot(), read_actuators(assets() / "recordings" / ACTUATORS_FILE)[1])
     full = virtual_robot.draw_robot(dataset.ROBOT_SEED)
     fits: dict[str, AirFit] = {}
     config = AirConfig(**train_aerodynamics.QUICK) if options.quick else AirConfig()
@@ -141,10 +141,10 @@ def main() -> None:
         legs = dataclasses.replace(full, **changes)
         folder = options.output / name.replace(" ", "-")
         gaits = [deflation.recorded(job, legs, 2000 + number, folder) for number, job in enumerate(training)]
-        motions = [reconstruct(gait, load_robot(), model) for gait in gaits]
-        fits[name] = identify_air(Simulator(load_robot(), model=model), motions, config)
+        motions = [reconstruct_for_simulator(gait, simulator) for gait in gaits]
+        fits[name] = identify_air(simulator, motions, config)
         print(f"{name}: cost {fits[name].cost[1]:.0f}", flush=True)
-    true = truth(full, buoyancy_ratio(model))
+    true = truth(full, buoyancy_ratio(simulator.mj_model))
     tables = {"identified": identified_table(fits[WHOLE], true), "legs": legs_table(fits, true)}
     _setup.write_tables(tables, options.output, options.results, {"robot": [dataset.ROBOT_SEED]})
     print(f"\nStandard errors are in parentheses. Written to {options.output}.")

@@ -35,7 +35,7 @@ from ballu_mjx.ballu.virtual import dataset
 from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.common.results import Cell, Table
 from ballu_mjx.recordings.motion_windows import MotionWindows
-from ballu_mjx.recordings.reconstruct import reconstruct
+from ballu_mjx.recordings.reconstruct import reconstruct_for_simulator
 from ballu_mjx.recordings.window_errors import pseudo_huber
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, AirWindows
 from ballu_mjx.residuals.trained_residual import TrainedResidual
@@ -127,7 +127,7 @@ def main() -> None:
     lost = deflation.lift(LOSS * full.buoyancy)
     gait = next(job for job in dataset.jobs() if job.split == "training")
     recorded = deflation.recorded(gait, deflated, 2000, options.output / "recordings")
-    motions = [reconstruct(recorded, load_robot(), model, drivetrain=simulator.drivetrain)]
+    motions = [reconstruct_for_simulator(recorded, simulator)]
     # A delay of whole physics steps, at which the errors are differentiable.
     timestep = float(model.opt.timestep)
     delay = np.round(float(known.params.delay) / timestep) * timestep

@@ -39,7 +39,7 @@ from ballu_mjx.evaluation.errors import Evaluation
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
 from ballu_mjx.recordings.csv_format import read_recording
 from ballu_mjx.recordings.motion import Motion
-from ballu_mjx.recordings.reconstruct import reconstruct
+from ballu_mjx.recordings.reconstruct import reconstruct_for_simulator
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, identify_air
 from ballu_mjx.residuals.trained_residual import TrainedResidual
@@ -113,7 +113,6 @@ def main() -> None:
         fidelity.train(air, "aerodynamic", *(["--quick"] if options.quick else []))
     known = TrainedResidual.load(air, load_robot())
     simulator = Simulator(load_robot(), known.actuators)
-    model = simulator.mj_model
     full = virtual_robot.draw_robot(dataset.ROBOT_SEED)
     deflated = dataclasses.replace(full, buoyancy=full.buoyancy * (1 - options.loss))
     bundled = dataset.jobs()
@@ -122,7 +121,7 @@ def main() -> None:
     def motions(virtual: VirtualRobot, jobs: Sequence[dataset.Job], first: int, name: str) -> list[Motion]:
         folder = options.output / name
         recordings = [recorded(job, virtual, first + number, folder) for number, job in enumerate(jobs)]
-        return [reconstruct(each, load_robot(), model, drivetrain=simulator.drivetrain) for each in recordings]
+        return [reconstruct_for_simulator(each, simulator) for each in recordings]
 
     tests = tests[:1] if options.quick else tests
     before, after = motions(full, tests, 1000, "before"), motions(deflated, tests, 1000, "after")

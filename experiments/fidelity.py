@@ -53,7 +53,7 @@ from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator, Replay
 from ballu_mjx.identification.actuators import read_actuators
 from ballu_mjx.policies.policy import Policy
 from ballu_mjx.recordings.csv_format import list_recordings, read_recording
-from ballu_mjx.recordings.reconstruct import reconstruct
+from ballu_mjx.recordings.reconstruct import reconstruct_for_simulator
 from ballu_mjx.recordings.recording_groups import OTHER
 from ballu_mjx.residuals.aerodynamics import AIR_PARAMETERS
 from ballu_mjx.residuals.aerodynamics_training import has_delay
@@ -201,10 +201,7 @@ def replayed_policy(options: Options) -> Path:
 def simulator(kind: TrainedResidual, paths: list[Path], *, nominal: bool = False) -> OpenLoopEvaluator:
     """Return an evaluator on recordings for a kind of residual, with its own actuators or with `nominal` ones."""
     plain = Simulator(load_robot(), None if nominal else kind.actuators)
-    motions = [
-        reconstruct(read_recording(path, load_robot()), load_robot(), plain.mj_model, drivetrain=plain.drivetrain)
-        for path in paths
-    ]
+    motions = [reconstruct_for_simulator(read_recording(path, load_robot()), plain) for path in paths]
     return OpenLoopEvaluator(plain, motions, kind.model)
 
 

@@ -37,7 +37,7 @@ from ballu_mjx.ballu.virtual import robot as virtual_robot
 from ballu_mjx.common.results import Cell, Table
 from ballu_mjx.recordings.csv_format import Split, list_bundled, read_recording
 from ballu_mjx.recordings.motion import Motion
-from ballu_mjx.recordings.reconstruct import reconstruct
+from ballu_mjx.recordings.reconstruct import reconstruct_for_simulator
 from ballu_mjx.recordings.reference import stack_motions
 from ballu_mjx.residuals.force_regression import ForceLabeller, SupervisedConfig
 from ballu_mjx.residuals.force_training import resolve_torque_spread
@@ -59,12 +59,8 @@ SEEN_WELL = {"position_noise": 2e-5, "angle_noise": 0.01, "held_angle_noise": 0.
 
 def reconstruct_split(split: Split, simulator: Simulator) -> dict[str, Motion]:
     """Return the reconstructed motions of a split of the bundled recordings, by name."""
-    robot = simulator.robot
-    recordings = [read_recording(path, robot) for path in list_bundled(split)]
-    return {
-        recording.name: reconstruct(recording, robot, simulator.mj_model, drivetrain=simulator.drivetrain)
-        for recording in recordings
-    }
+    recordings = [read_recording(path, simulator.robot) for path in list_bundled(split)]
+    return {recording.name: reconstruct_for_simulator(recording, simulator) for recording in recordings}
 
 
 def twin(job: dataset.Job) -> Motion:

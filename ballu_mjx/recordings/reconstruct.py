@@ -38,6 +38,7 @@ from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.recordings.recording_hooks import hooks_of
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.drivetrain import DrivetrainParameters, count_slots, filter_commands
+from ballu_mjx.sim.simulator import Simulator
 
 _STOP_TOLERANCE = {False: float(np.deg2rad(0.5)), True: 5e-4}
 """Distance by which a hinge (False, rad) or a slide (True, m) may exceed its range. Stops are soft, and springs press
@@ -91,6 +92,14 @@ def reconstruct(
         joints=tuple(recording.joint_angles),
         uncertainty=fit.uncertainty,
     )
+
+
+def reconstruct_for_simulator(recording: Recording, simulator: Simulator) -> Motion:
+    """Return states from which `simulator` follows a recording: `reconstruct` with its model and drivetrain.
+
+    **Raises** as `reconstruct` does.
+    """
+    return reconstruct(recording, simulator.robot, simulator.mj_model, drivetrain=simulator.drivetrain)
 
 
 def _driven(grid: MeasurementGrid, drivetrain: DrivetrainParameters | None) -> MeasurementGrid:

@@ -13,7 +13,7 @@ from ballu_mjx.identification.actuators import AUTO, NOMINAL, find_actuators, re
 from ballu_mjx.recordings.csv_format import list_recordings, read_recording
 from ballu_mjx.recordings.load import bundled_recordings
 from ballu_mjx.recordings.motion import Motion
-from ballu_mjx.recordings.reconstruct import reconstruct
+from ballu_mjx.recordings.reconstruct import reconstruct_for_simulator
 from ballu_mjx.recordings.recording import Recording, Split
 from ballu_mjx.recordings.recording_groups import group_of
 from ballu_mjx.residuals.run_config import find_recordings, run_actuators
@@ -142,10 +142,7 @@ class ResidualDataset:
             if same is not None:
                 motions[use] = motions[same]
             else:
-                motions[use] = [
-                    reconstruct(each, self.robot, simulator.mj_model, drivetrain=simulator.drivetrain)
-                    for each in self.recordings[use]
-                ]
+                motions[use] = [reconstruct_for_simulator(each, simulator) for each in self.recordings[use]]
         return motions
 
 
