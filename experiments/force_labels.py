@@ -40,7 +40,7 @@ from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reconstruct import reconstruct_for_simulator
 from ballu_mjx.recordings.reference import stack_motions
 from ballu_mjx.residuals.force_regression import ForceLabeller, SupervisedConfig
-from ballu_mjx.residuals.force_training import resolve_torque_spread
+from ballu_mjx.residuals.force_training import resolve_joint_spreads
 from ballu_mjx.residuals.network import NetworkResidual
 from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.robots.registry import load_robot
@@ -153,7 +153,7 @@ def main() -> None:
     known = reconstruct_split("training", simulator)
     assert isinstance(first.model, NetworkResidual)
     env = first.model.config
-    config = resolve_torque_spread(config, env.forces, simulator, list(known.values()))
+    config = resolve_joint_spreads(config, env.forces, simulator, list(known.values()))
     label = ForceLabeller(linearize, config, env)
     label_well = ForceLabeller(linearize, dataclasses.replace(config, **SEEN_WELL), env)
 

@@ -51,6 +51,9 @@ class SupervisedConfig:
     torque_spread: float | None = None
     """Standard deviation of the joint torques that the model lacks, N m. Without this option: the largest RMS torque
     that the model leaves unexplained at a joint in the training recordings."""
+    slide_force_spread: float | None = None
+    """Standard deviation of the forces along slides that the model lacks, N. Without this option: the largest RMS force
+    that the model leaves unexplained along a slide in the training recordings."""
     position_noise: float = 0.0005
     """Standard deviation of the error of recorded positions, m."""
     angle_noise: float = 0.3
@@ -109,6 +112,8 @@ class _Priors(NamedTuple):
     """Of the change of forces in a control step (N)."""
     torque: float | None
     """Of joint torques (N m). None if unknown."""
+    slide_force: float | None
+    """Of forces along slides (N). None if unknown."""
 
 
 def _priors(config: SupervisedConfig, unit: float) -> _Priors:
@@ -118,6 +123,7 @@ def _priors(config: SupervisedConfig, unit: float) -> _Priors:
         _SPREAD * unit if spread is None else spread,
         _CHANGE * unit if change is None else change,
         config.torque_spread,
+        config.slide_force_spread,
     )
 
 
@@ -149,8 +155,12 @@ class ForceLabeller:
         scales = load_scales(env, self._simulator.robot)
         self._in_newtons = scales.units / scales.newtons
         self._priors = _priors(config, scales.newtons)
-        if self._priors.torque is None and linearize.directions > 2 * self._model.nv + linearize.loads:
-            raise ValueError("The spread of the joint torques is unknown; set torque_spread.")
+        slides = translations(self._model)[linearize.joint_directions]
+        options = {"torque_spread": self._priors.torque, "slide_force_spread": self._priors.slide_force}
+        for there, (name, value) in zip((not slides.all(), bool(slides.any())), options.items(), strict=True):
+            if there and value is None:
+                raise ValueError(f"The spread of what the model lacks at joints is unknown; set {name}.")
+        self._at_joints = np.where(slides, self._priors.slide_force or 0.0, self._priors.torque or 0.0)
         self._measured, self._process = _noise(self._model, self._simulator.robot, config)
 
     def __call__(self, motion: Motion) -> Float[np.ndarray, "steps loads"]:
@@ -188,7 +198,7 @@ class ForceLabeller:
             self._measured,
             np.full(self._model.nv, _ANY_VELOCITY),
             self._priors.spread * self._in_newtons,
-            np.full(every - after - loads, self._priors.torque),
+            self._at_joints,
         ]
         here = np.tile(np.diag(spread**-2.0), (count + 1, 1, 1))
         here[:-1] += state.transpose(0, 2, 1) @ (weight[:, :, None] * state)

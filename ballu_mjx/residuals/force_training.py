@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
+import mujoco
 import numpy as np
 from jaxtyping import Float
 
@@ -108,21 +109,36 @@ def free_torques(forces: ForceSet, robot: RobotDescription) -> tuple[str, ...]:
     return robot.joints if FORCE_SETS[forces].turns and force_sets.num_loads("joints", robot) else ()
 
 
-def resolve_torque_spread(
+def resolve_joint_spreads(
     config: SupervisedConfig,
     forces: ForceSet,
     simulator: Simulator | AugmentedSimulator,
     motions: Sequence[Motion],
 ) -> SupervisedConfig:
-    """Return options whose `torque_spread` is set.
+    """Return options whose `torque_spread` and `slide_force_spread` are set, as far as the robot has such joints.
 
-    An open value becomes the largest RMS torque that the model lacks at a joint along the motions. The options are
-    returned unchanged if no joint torque is an unknown of the labelling.
+    An open value becomes the largest RMS torque (of slides: force) that the model lacks at a joint along the motions.
+    The options are returned unchanged if no joint torque is an unknown of the labelling.
     """
-    if config.torque_spread is not None or not free_torques(forces, simulator.robot):
+    robot, model = simulator.robot, simulator.with_residual(None).simulator.mj_model
+    slides = [model.joint(name).type[0] == mujoco.mjtJoint.mjJNT_SLIDE for name in free_torques(forces, robot)]
+    units = [unit for slide, unit in ((False, "N m"), (True, "N")) if slide in slides]
+    names = {"N m": "torque_spread", "N": "slide_force_spread"}
+    missing = [unit for unit in units if getattr(config, names[unit]) is None]
+    if not missing:
         return config
     size = missing_loads(simulator, motions, "joints").rms
-    return dataclasses.replace(config, torque_spread=float(size.max(initial=0.0)))
+    found = {
+        names[unit]: max(
+            (x for x, joint in zip(size, robot.force_joints.values(), strict=True) if joint.unit == unit), default=0
+        )
+        for unit in missing
+    }
+    return dataclasses.replace(config, **{name: max(float(value), _LEAST_SPREAD) for name, value in found.items()})
+
+
+_LEAST_SPREAD = 1e-9
+"""Spread (N, N m) of joint torques at joints where no residual force may act, or that need none."""
 
 
 class _Uses(NamedTuple):
@@ -195,7 +211,7 @@ class _Supervised(_Fit):
         assert isinstance(config, SupervisedConfig)
         robot, env = setup.simulator.robot, setup.forces.config
         joints = free_torques(env.forces, robot)
-        config = resolve_torque_spread(config, env.forces, setup.simulator, setup.motions.training)
+        config = resolve_joint_spreads(config, env.forces, setup.simulator, setup.motions.training)
         linearize = Linearizer(setup.simulator, joints, env.forces)
         label = force_regression.ForceLabeller(linearize, config, env)
         uses = {"training": setup.motions.training}

@@ -55,8 +55,8 @@ _SMALLEST_SHARE = 0.2
 _SMALLEST_SCALE = 1e-6
 """Smallest scale of a load, for a model that explains everything."""
 _WEAKEST = 0.05
-"""Smallest singular value of the loads' effects that counts, as a fraction of the largest one. Combinations of loads
-with a smaller effect are set to 0."""
+"""Smallest singular value of the loads' effects that counts, as a fraction of the largest one. Effects are relative to
+those on a robot that is free to move. Combinations of loads with a smaller effect are set to 0."""
 _PERTURBATION = 0.1
 """Change of a command for the measurement of its effect, as a fraction of its range."""
 
@@ -162,9 +162,14 @@ def missing_loads(
         if acts is None:
             low, high = np.array(robot.command_ranges).T
             changes = _PERTURBATION * (high - low) * np.where(sent > (low + high) / 2, -1.0, 1.0)
+            sizes = np.broadcast_to(1 / (high - low), (len(here), len(robot.commands)))
         else:
             # The loads are perturbed by their size according to mass and time alone.
-            guess = _solve_loads(root, np.linalg.solve(mass, acts) * robot.control_timestep, missing)
+            free = np.linalg.solve(mass, acts) * robot.control_timestep
+            sizes = np.linalg.norm(root @ free, axis=1)
+            if FORCE_SETS[forces].turns:  # the axes of a vector have one unit
+                sizes = sizes.reshape(len(here), -1, 3).max(axis=2).repeat(3, axis=1)
+            guess = _solve_loads(root, free, missing, sizes)
             changes = np.broadcast_to(_summarize(guess).rms, (len(motion.command), acts.shape[2]))
         effects = []
         for load, change in enumerate(changes.T):
@@ -175,7 +180,7 @@ def missing_loads(
                 force[here] += acts[:, :, load] * change[here, None]
             moved = _step(plain, model, motion, command, force, here)
             effects.append((moved - after[here]) / change[here, None])
-        loads = _solve_loads(root, np.stack(effects, axis=2), missing)
+        loads = _solve_loads(root, np.stack(effects, axis=2), missing, sizes)
         if FORCE_SETS[forces].turns and heading_frame and not robot.anchored:
             to_heading = Rotation.from_euler("z", -yaws[number, here, None]).as_matrix()
             loads = (loads.reshape(len(here), -1, 3) @ to_heading.swapaxes(1, 2)).reshape(len(here), -1)
@@ -310,6 +315,7 @@ def _solve_loads(
     root: Float[np.ndarray, "states nv nv"],
     effects: Float[np.ndarray, "states nv loads"],
     missing: Float[np.ndarray, "states nv"],
+    sizes: Float[np.ndarray, "states loads"],
 ) -> Float[np.ndarray, "states loads"]:
     """Return the loads that best explain the errors of velocities after control steps, by kinetic energy.
 
@@ -318,11 +324,12 @@ def _solve_loads(
     - `root`: transposed Cholesky factors of the mass matrices.
     - `effects`: derivatives of the velocities with respect to the loads.
     - `missing`: recorded velocities minus simulated velocities.
+    - `sizes`: effects of unit loads that count as large. They make loads of different units comparable.
 
     **Returns** the loads. They are NaN if `effects` or `missing` are not finite.
     """
     good = np.isfinite(missing).all(axis=1) & np.isfinite(effects).all(axis=(1, 2))
     found = np.full((len(missing), effects.shape[2]), np.nan)
-    inverse = np.linalg.pinv(root[good] @ effects[good], rcond=_WEAKEST)
-    found[good] = (inverse @ (root[good] @ missing[good, :, None]))[..., 0]
+    inverse = np.linalg.pinv(root[good] @ effects[good] / sizes[good, None], rcond=_WEAKEST)
+    found[good] = (inverse @ (root[good] @ missing[good, :, None]))[..., 0] / sizes[good]
     return found

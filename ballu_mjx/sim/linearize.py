@@ -68,12 +68,14 @@ class Linearizer:
         joints: Sequence[str] = (),
         forces: ForceSet = "force",
     ) -> None:
-        """Prepare to linearize control steps of `simulator`. Torques of the joints named in `joints` are inputs too."""
+        """Prepare to linearize control steps of `simulator`. Torques of the joints named in `joints` (forces of slides)
+        are inputs too."""
         self.simulator = simulator.with_residual(None)
         plain = self.simulator.simulator
         self._nv, self._free = plain.nv, has_free_joint(plain.mj_model)
         self._forces: ForceSet = forces
-        self._joints = np.array([plain.mj_model.joint(name).dofadr[0] for name in joints], int)
+        self.joint_directions = np.array([plain.mj_model.joint(name).dofadr[0] for name in joints], int)
+        """Index in the velocities of each joint whose torque is an input."""
         self.loads = num_loads(forces, plain.robot)
         over = functools.partial(nested_vmap, inner=self.directions, store_operands=has_dry_friction(plain.model))
         self._each = shard_over_devices(self._one, shared=0, over=over)
@@ -81,7 +83,7 @@ class Linearizer:
     @property
     def directions(self) -> int:
         """Number of directions of the state before a step and of the inputs."""
-        return 2 * self._nv + self.loads + len(self._joints)
+        return 2 * self._nv + self.loads + len(self.joint_directions)
 
     def __call__(self, steps: ControlSteps) -> Linearized:
         """Return the linearization of control steps. Derivatives of a step become 0 if any of them is not finite."""
@@ -105,7 +107,7 @@ class Linearizer:
         def after(moved: PhysicsState, inputs: Float[Array, " inputs"]) -> tuple[PhysicsState, Array]:
             loads = jnp.asarray(step.loads) + inputs[: self.loads]
             does = FORCE_SETS[self._forces].act(loads, self.simulator.robot)
-            torques = jnp.zeros(nv).at[self._joints].set(inputs[self.loads :])
+            torques = jnp.zeros(nv).at[self.joint_directions].set(inputs[self.loads :])
             history = jnp.asarray(step.state.history)
             if self.simulator.residual is not None:  # the residual observes the perturbed state
                 history = history.at[-1].set(self.simulator.simulator.observe(moved)[0])

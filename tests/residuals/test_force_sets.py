@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 import pytest
 from plain_push import PlainPush
+from robot_files import write_robot
 from servo_arm import wandering, write_arm
 
 from ballu_mjx.common.errors import InputError
@@ -198,6 +199,32 @@ def test_scales_are_rounded_to_one_two_or_five(size: float, scale: float):
 def test_friction_at_a_joint_gives_a_missing_load_at_that_joint(robot: RobotDescription, simulator: Simulator):
     missing = missing_loads(simulator, [move(robot, friction=0.1)], "joints").rms
     assert 0.03 < missing[0] < 0.11 and missing[1] < 0.2 * missing[0]
+
+
+MOTE = """<mujoco><option timestep="0.01" integrator="implicitfast" gravity="0 0 0"/><worldbody><body name="mote">
+  <freejoint/><geom size="{radius} {radius} {radius}" type="box" density="100"/><site name="mote"/>
+  <body name="flap"><joint name="flap" axis="0 0 1" damping="1"/><geom size="{radius}" mass="1e-9"/></body>
+</body></worldbody><actuator><motor name="flap" joint="flap" ctrlrange="-1 1"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("radius", [0.002, 0.2])
+def test_missing_forces_and_torques_are_found_on_small_and_on_large_robots(radius: float, tmp_path: Path):
+    """The same torque turns a small body far more than the same force moves it, per newton metre and per newton."""
+    xml = MOTE.format(radius=radius)
+    robot = write_robot(tmp_path, "mote", xml, tracked="mote", points=[], commands={"flap": "flap"})
+    model = robot.load_model()
+    mass, inertia = model.body_mass[1], model.body_inertia[1, 0]
+    load = np.array([1.0, -2.0, 0.5, 0.0, 0.0, 3.0]) * np.r_[[0.1 * mass] * 3, [0.1 * inertia] * 3]
+    data = mujoco.MjData(model)
+    data.xfrc_applied[1] = load
+    states = [(data.qpos.copy(), data.qvel.copy())]
+    for _ in range(20):
+        mujoco.mj_step(model, data, count_substeps(model, robot.control_timestep))
+        states.append((data.qpos.copy(), data.qvel.copy()))
+    qpos, qvel = map(np.array, zip(*states, strict=True))
+    motion = Motion("drift", np.arange(21) * robot.control_timestep, np.zeros((20, 1)), qpos, qvel, {})
+    missing = missing_loads(Simulator(robot), [motion], "wrench", heading_frame=False)
+    np.testing.assert_allclose(missing.mean, load, rtol=0.02, atol=1e-3 * np.abs(load).min(initial=1, where=load != 0))
 
 
 def test_joint_forces_need_suitable_joints(robot: RobotDescription, tmp_path: Path):

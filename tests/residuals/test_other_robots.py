@@ -9,6 +9,7 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 from rover import write_rover
@@ -25,7 +26,7 @@ from ballu_mjx.residuals.aerodynamics_fit import AirConfig, identify_air
 from ballu_mjx.residuals.envmimic import EnvMimicConfig, start_spread
 from ballu_mjx.residuals.force_gradients import AnalyticConfig
 from ballu_mjx.residuals.force_regression import SupervisedConfig
-from ballu_mjx.residuals.force_training import fit_analytic, fit_supervised
+from ballu_mjx.residuals.force_training import fit_analytic, fit_supervised, resolve_joint_spreads
 from ballu_mjx.residuals.network import NetworkResidual
 from ballu_mjx.residuals.network_input import num_inputs, recorded_inputs
 from ballu_mjx.residuals.network_loads import load_units, num_loads
@@ -186,6 +187,29 @@ def test_command_delay_of_the_air_uses_the_robot_s_control_time_step(tmp_path: P
     sent = jnp.array([[0.0, 0.0], [0.5, 0.5], [1.0, 1.0]])
     arrived = np.asarray(Aerodynamics(fast, fast.load_model()).command(air, sent))
     np.testing.assert_array_equal(arrived[:, 0], [0.0, 0.5])
+
+
+def test_torques_of_hinges_and_forces_of_slides_have_spreads_of_their_own(tmp_path: Path):
+    robot = dataclasses.replace(write_rover(tmp_path), joints=("shoulder", "rod"))
+    model, push = robot.load_model(), np.zeros(robot.directions)
+    model.dof_damping[model.joint("rod").dofadr] = 60.0  # so that the rod does not reach its stop
+    simulator, data = Simulator(robot, model=model), mujoco.MjData(model)
+    for joint, force in (("shoulder", 0.02), ("rod", 0.8)):  # N m, N
+        push[model.joint(joint).dofadr[0]] = force
+    mujoco.mj_resetDataKeyframe(model, data, 0)
+    data.qfrc_applied[:] = push
+    states = [(data.qpos.copy(), data.qvel.copy())]
+    for _ in range(STEPS):
+        mujoco.mj_step(model, data, 4)
+        states.append((data.qpos.copy(), data.qvel.copy()))
+    qpos, qvel = map(np.array, zip(*states, strict=True))
+    command = np.tile(data.ctrl, (STEPS, 1))
+    motions = [Motion("drive", np.arange(STEPS + 1) * robot.control_timestep, command, qpos, qvel, {})]
+    found = resolve_joint_spreads(SupervisedConfig(), "force", simulator, motions)
+    assert found.torque_spread == pytest.approx(0.02, rel=0.2)
+    assert found.slide_force_spread == pytest.approx(0.8, rel=0.2)
+    given = resolve_joint_spreads(SupervisedConfig(slide_force_spread=3.0), "force", simulator, motions)
+    assert (given.torque_spread, given.slide_force_spread) == (found.torque_spread, 3.0)
 
 
 def test_starting_states_of_held_joints_hardly_vary(tmp_path: Path):
