@@ -31,6 +31,7 @@ from ballu_mjx.residuals.dataset import RecordingsData
 from ballu_mjx.residuals.run_config import describe_run, run_actuators
 from ballu_mjx.robots.description import RobotDescription, read_description
 from ballu_mjx.robots.model import same_parameters
+from ballu_mjx.robots.registry import load_robot
 
 
 def write_recorded_arm(folder: Path) -> RobotDescription:
@@ -241,6 +242,15 @@ def test_options_of_declared_parameters_are_refused_for_ballu(option: tuple[str,
     assert train.main(["sysid", *option]) == 2
     message = f"{option[0]} is for declared parameters, but ballu has its own method"
     assert message in capsys.readouterr().err.lower()
+
+
+def test_declared_parameters_beside_an_own_method_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture):
+    ballu = load_robot()
+    content = json.loads(ballu.file.read_text()) | {"model": str(ballu.model)}
+    content["identify"] = [{"joint": "knee_left", "field": "damping", "bounds": [0.0, 0.1], "prior": 0.01}]
+    (tmp_path / "mine.robot.json").write_text(json.dumps(content))
+    assert train.main(["sysid", "--robot", str(tmp_path / "mine.robot.json")]) == 2
+    assert 'mine.robot.json: "identify" has no effect' in capsys.readouterr().err
 
 
 def test_actuators_file_of_another_declaration_is_refused(robot: RobotDescription, tmp_path: Path):
