@@ -79,7 +79,7 @@ def parse_json(text: str, where: str, fix: str) -> Any:
     return content
 
 
-def finite_or_none(value: float) -> float | None:
+def finite_or_none(value: float | int) -> float | int | None:
     """Return a number as JSON can express it: None if it is infinite or not a number."""
     return value if math.isfinite(value) else None
 
