@@ -91,8 +91,8 @@ def train(
         return _train_declared(data, fit, windows, sampling, robot)
     if robot.identify:
         raise InputError(
-            f'{robot.file}: "identify" has no effect, because {robot.name} has its own method; remove this key, or leave '
-            'out "adapter".'
+            f'{robot.file}: "identify" has no effect, because {robot.name} has its own method; remove this key, or '
+            'leave out "adapter".'
         )
     given = [name for name in ("validation", "actuators") if getattr(data, name)]
     for changed in (*_changed(windows), *_changed(sampling), *given):

@@ -19,8 +19,8 @@ class ForceNetworkConfig:
     """Largest force along each axis, N (paper: 1). Other loads have the same limit in units of the network's output.
     Without this option: 20 units."""
     force_scale: float | None = None
-    """Force for one unit of the network's output, N. Without this option: from the training recordings, the RMS
-    deviation of the missing force from its mean, rounded to 1, 2 or 5 times a power of ten. Joints and commands have
+    """Force for one unit of the network's output, N. Without this option: from the training recordings, the RMS of the
+    missing force along an axis, rounded to 1, 2 or 5 times a power of ten. Joints and commands have
     `--scales` instead; for limit and cost, one of their units counts as this force."""
     torque_scale: float | None = None
     """Torque for one unit of the network's output, N m, with `--forces wrench`. Without this option: the same as for

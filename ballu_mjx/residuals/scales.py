@@ -7,7 +7,8 @@ The lacking loads are estimated by one-step inverse dynamics along the training 
 3. The loads of the force set that explain the averaged error are found by least squares in kinetic energy.
 
 EnvMimic's policy starts at the mean of these loads, which is large where a weight or a lift is wrong. Scales are the
-RMS deviations from the mean, at least a fifth of the RMS, rounded to 1, 2 or 5 times a power of ten.
+RMS of the loads, rounded to 1, 2 or 5 times a power of ten. The RMS includes the mean: one-step inverse dynamics can be
+wrong by a large part of it, and a policy must be able to correct this.
 
 The effect of a load on the velocities is measured by a second simulation with this load. Mass and time alone do not
 give it: a stiff actuator undoes most of a load on its joint within the step, so the load would be underestimated.
@@ -50,8 +51,6 @@ _STATES = 2000
 """Number of states for which loads are estimated, if the recordings have as many. Up to twice as many are used."""
 _QUANTILE = 0.95
 """Quantile to which larger loads are clipped. Contacts and gaps in recordings make single loads huge."""
-_SMALLEST_SHARE = 0.2
-"""Smallest scale, as a share of the RMS, so that almost constant loads stay within the limit."""
 _SMALLEST_SCALE = 1e-6
 """Smallest scale of a load, for a model that explains everything."""
 _WEAKEST = 0.05
@@ -82,7 +81,7 @@ def resolve_scales(config: Config, simulator: Simulator | AugmentedSimulator, mo
     found: dict[str, Any] = {}
     if open_force or open_torque or open_scales or open_mean:
         missing = missing_loads(augmented, motions, forces, heading_frame=config.heading_frame)
-        size = np.maximum(missing.deviation, _SMALLEST_SHARE * missing.rms)
+        size = missing.rms
         found["force_scale"] = round_scale(_rms(size[:3] if forces == "wrench" else size)) if vectors else 1.0
         found["torque_scale"] = round_scale(_rms(size[3:])) if forces == "wrench" else None
         found["scales"] = () if vectors else tuple(map(round_scale, size))
@@ -128,10 +127,8 @@ class MissingLoads(NamedTuple):
 
     mean: Float[np.ndarray, " loads"]
     """Mean over the states."""
-    deviation: Float[np.ndarray, " loads"]
-    """RMS of the deviation from the mean."""
     rms: Float[np.ndarray, " loads"]
-    """RMS of the loads themselves."""
+    """Root mean square over the states, which includes the mean."""
 
 
 def missing_loads(
@@ -193,12 +190,11 @@ def _summarize(loads: Float[np.ndarray, "states loads"]) -> MissingLoads:
     good = loads[np.isfinite(loads).all(axis=1)]
     if not len(good):
         smallest = np.full(loads.shape[1], _SMALLEST_SCALE)
-        return MissingLoads(0.0 * smallest, smallest, smallest)
+        return MissingLoads(0.0 * smallest, smallest)
     largest = np.quantile(np.abs(good), _QUANTILE, axis=0)
     good = np.clip(good, -largest, largest)
-    mean = good.mean(axis=0)
-    sizes = (np.sqrt(np.mean(each**2, axis=0)) for each in (good - mean, good))
-    return MissingLoads(mean, *(np.maximum(size, _SMALLEST_SCALE) for size in sizes))
+    rms = np.sqrt(np.mean(good**2, axis=0))
+    return MissingLoads(good.mean(axis=0), np.maximum(rms, _SMALLEST_SCALE))
 
 
 def _rms(values: Float[np.ndarray, " loads"]) -> float:
