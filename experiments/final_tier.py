@@ -344,7 +344,7 @@ def transfer_tables(task: str, results: Sequence[Sequence[Mapping[str, Any]]]) -
     """Return the tables of a task, `results[robot][training][setting]`.
 
     Cells of `summary` are means over robots with Student's t interval. Each robot's value is the mean over training
-    seeds and trials. `robots` has the values of each robot and training seed.
+    seeds and trials. `short` has its first and last columns. `robots` has the values of each robot and training seed.
     """
     figures = FIGURES[task]
     by_robot = [_by_setting(trainings, figures) for trainings in results]
@@ -368,8 +368,11 @@ def transfer_tables(task: str, results: Sequence[Sequence[Mapping[str, Any]]]) -
         for name, robot in zip(ROBOTS, by_robot, strict=True)
         for setting in settings
     ]
+    short = (0, 1, 2, -2, -1)
+    columns = ("setting", *titles, *counts, *beside)
     return {
-        "summary": Table(("setting", *titles, *counts, *beside), tuple(rows)),
+        "short": Table(tuple(columns[i] for i in short), tuple(tuple(row[i] for i in short) for row in rows)),
+        "summary": Table(columns, tuple(rows)),
         "robots": Table(("robot", "setting", *titles), tuple(made)),
     }
 

@@ -108,7 +108,7 @@ class Results:
             f" {use.capitalize()} {_counted('seed', len(s))}: {', '.join(map(str, s))}."
             for use, s in self.seeds.items()
         )
-        seeds += " One seed ranks nothing." if len(self.seeds.get("training", (0, 1))) == 1 else ""
+        seeds += " One seed on one robot ranks nothing." if len(self.seeds.get("training", (0, 1))) == 1 else ""
         cores = int(self.machine["cores"])
         machine = f"{cores} {_counted('core', cores)} of {self.machine['cpu']}"
         return f"{self.data}. `{self.command}`{commit}, {machine}.{seeds}"
