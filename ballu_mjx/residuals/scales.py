@@ -166,6 +166,8 @@ def missing_loads(
             sizes = np.linalg.norm(root @ free, axis=1)
             if FORCE_SETS[forces].turns:  # the axes of a vector have one unit
                 sizes = sizes.reshape(len(here), -1, 3).max(axis=2).repeat(3, axis=1)
+            # A load without an effect, such as a torque on a robot of slides, does not become large by scaling.
+            sizes = np.maximum(sizes, np.maximum(1e-6 * sizes.max(axis=1, keepdims=True), np.finfo(float).tiny))
             guess = _solve_loads(root, free, missing, sizes)
             changes = np.broadcast_to(_summarize(guess).rms, (len(motion.command), acts.shape[2]))
         effects = []

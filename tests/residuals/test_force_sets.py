@@ -230,6 +230,24 @@ def test_missing_forces_and_torques_are_found_on_small_and_on_large_robots(radiu
     assert config.force_scale == round_scale(float(np.sqrt(np.mean(load[:3] ** 2))))
 
 
+def test_loads_without_an_effect_are_taken_as_zero(tmp_path: Path):
+    """A torque has no effect on a carriage that can only slide, and a force only along its rail."""
+    xml = """<mujoco><option timestep="0.01" integrator="implicitfast" gravity="0 0 0"/><worldbody><body>
+    <joint name="rail" type="slide" axis="1 0 0"/><geom size="0.1" mass="0.5"/><site name="carriage"/>
+    </body></worldbody><actuator><motor name="push" joint="rail" ctrlrange="-1 1"/></actuator></mujoco>"""
+    robot = write_robot(tmp_path, "carriage", xml, tracked="carriage", commands={"push": "push"})
+    data = mujoco.MjData(robot.load_model())
+    data.qfrc_applied[0] = 0.2
+    states = [(data.qpos.copy(), data.qvel.copy())]
+    for _ in range(20):
+        mujoco.mj_step(data.model, data, count_substeps(data.model, robot.control_timestep))
+        states.append((data.qpos.copy(), data.qvel.copy()))
+    qpos, qvel = map(np.array, zip(*states, strict=True))
+    motion = Motion("slide", np.arange(21) * robot.control_timestep, np.zeros((20, 1)), qpos, qvel, {})
+    missing = missing_loads(Simulator(robot), [motion], "wrench")
+    np.testing.assert_allclose(missing.mean, [0.2, 0, 0, 0, 0, 0], rtol=0.01, atol=1e-9)
+
+
 def test_joint_forces_need_suitable_joints(robot: RobotDescription, tmp_path: Path):
     content = json.loads(robot.file.read_text()) | {"force_joints": [], "model": str(robot.model)}
     (tmp_path / "stiff.robot.json").write_text(json.dumps(content))
