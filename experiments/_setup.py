@@ -50,11 +50,12 @@ def reserve(folder: Path, **settings: object) -> None:
 
     **Raises** `InputError` naming the differences if the folder has results of other settings, or of unknown ones.
     """
+    from ballu_mjx.common import files
     from ballu_mjx.common.errors import InputError
 
     path = folder / "settings.json"
     if path.exists():
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = files.read_json(path, "choose another folder with --output")
         wanted = json.loads(json.dumps(settings))
         other = [f"{name} {found.get(name)}" for name in wanted if wanted[name] != found.get(name)]
         if other:
@@ -63,7 +64,7 @@ def reserve(folder: Path, **settings: object) -> None:
         raise InputError(f"{folder} has files but no {path.name}; choose another folder with --output.")
     else:
         folder.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(settings, indent=2) + "\n", encoding="utf-8")
+        files.write(path, json.dumps(settings, indent=2) + "\n")
 
 
 def write_table(text: str, folder: Path) -> None:

@@ -7,11 +7,12 @@ from typing import Any
 
 import mujoco
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.stats import t as student
 
 from ballu_mjx.common.files import finite_or_none
 from ballu_mjx.identification.fit_robot import HeldOut, RobotFit
+from ballu_mjx.sim.coordinates import translations
 
 
 def intervals(fit: RobotFit) -> Float[np.ndarray, "parameters 2"]:
@@ -37,13 +38,9 @@ def channel_names(model: mujoco.MjModel) -> tuple[str, ...]:
     return tuple(names)
 
 
-def angular_channels(model: mujoco.MjModel) -> np.ndarray:
+def angular_channels(model: mujoco.MjModel) -> Bool[np.ndarray, " channels"]:
     """Return a mask of the channels in rad. The others are in m."""
-    kinds = []
-    for kind in model.jnt_type:
-        free = kind == mujoco.mjtJoint.mjJNT_FREE
-        kinds += [False] * 3 + [True] * 3 if free else [kind == mujoco.mjtJoint.mjJNT_HINGE]
-    return np.array(kinds, bool)
+    return ~translations(model)
 
 
 def channel_scales(model: mujoco.MjModel) -> tuple[Float[np.ndarray, " channels"], tuple[str, ...]]:

@@ -7,7 +7,7 @@ from functools import partial
 
 import mujoco
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from scipy.signal import savgol_coeffs
 
 from ballu_mjx.common.errors import InputError
@@ -15,6 +15,7 @@ from ballu_mjx.recordings.filters import interpolate, mean_command, odd_window, 
 from ballu_mjx.recordings.motion import Motion, ReconstructionParameters
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.robots.description import RobotDescription
+from ballu_mjx.sim.coordinates import translations
 
 
 def check_sampling_config(config: SamplingConfig) -> None:
@@ -109,7 +110,7 @@ def measure(
     filtered = partial(savitzky_golay, angles, step=sample / fine, order=config.order)
     rates, narrow = (filtered(width, derivative=1) for width in (config.rate_window, config.rate_window / 2))
     window = odd_window(config.rate_window, sample / fine, config.order, len(grid))
-    noise = np.where(_slides(model), config.slide_noise, config.angle_noise)
+    noise = np.where(translations(model), config.slide_noise, config.angle_noise)
     passed = noise * np.linalg.norm(savgol_coeffs(window, config.order, deriv=1, delta=sample / fine))
     uncertainty = np.hypot(np.std(rates - narrow, axis=0), _SURE * np.std(rates, axis=0) + 1e-6)
     # A semi-implicit integrator's velocity is the mean over the time step that led to the position.
@@ -126,11 +127,6 @@ def measure(
         position_noise=noise,
         velocity_noise=np.maximum(uncertainty, passed),
     )
-
-
-def _slides(model: mujoco.MjModel) -> Bool[np.ndarray, " nv"]:
-    """Return which velocities belong to slides."""
-    return model.jnt_type[model.dof_jntid] == mujoco.mjtJoint.mjJNT_SLIDE
 
 
 def held_motion(
@@ -189,6 +185,6 @@ def measured_from_motion(
         qpos=motion.qpos,
         start_qpos=motion.qpos,
         qvel=motion.qvel,
-        position_noise=np.where(_slides(model), parameters.position_noise, positions[kinds]),
+        position_noise=np.where(translations(model), parameters.position_noise, positions[kinds]),
         velocity_noise=np.array(velocity_noise)[kinds],
     )

@@ -122,23 +122,21 @@ def resolve_joint_spreads(
     """
     robot, model = simulator.robot, simulator.with_residual(None).simulator.mj_model
     slides = [model.joint(name).type[0] == mujoco.mjtJoint.mjJNT_SLIDE for name in free_torques(forces, robot)]
-    units = [unit for slide, unit in ((False, "N m"), (True, "N")) if slide in slides]
-    names = {"N m": "torque_spread", "N": "slide_force_spread"}
-    missing = [unit for unit in units if getattr(config, names[unit]) is None]
+    units = {"torque_spread": "N m" if False in slides else None, "slide_force_spread": "N" if True in slides else None}
+    missing = {name: unit for name, unit in units.items() if unit and getattr(config, name) is None}
     if not missing:
         return config
     size = missing_loads(simulator, motions, "joints").rms
+    joints = list(zip(size, robot.force_joints.values(), strict=True))
     found = {
-        names[unit]: max(
-            (x for x, joint in zip(size, robot.force_joints.values(), strict=True) if joint.unit == unit), default=0
-        )
-        for unit in missing
+        name: float(max((x for x, joint in joints if joint.unit == unit), default=_LEAST_SPREAD))
+        for name, unit in missing.items()
     }
-    return dataclasses.replace(config, **{name: max(float(value), _LEAST_SPREAD) for name, value in found.items()})
+    return dataclasses.replace(config, **found)
 
 
 _LEAST_SPREAD = 1e-9
-"""Spread (N, N m) of joint torques at joints where no residual force may act, or that need none."""
+"""Spread (N, N m) of joint torques where no residual force may act along a joint of the kind."""
 
 
 class _Uses(NamedTuple):

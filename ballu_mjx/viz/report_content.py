@@ -211,8 +211,9 @@ def _add_identification(content: Content, folder: Path) -> None:
         for each in found["parameters"]:
             low, high = each["interval"]
             notes = ["not shown"] * (not each["seen"]) + ["at a bound"] * bool(each["at_bound"])
-            numbers = [each[key] for key in ("nominal", "value", "standard_error", "white_noise_error")]
-            cells = [_number(x, 4, "none") for x in (*numbers, low, high)]
+            numbers = [each[key] for key in ("value", "standard_error", "white_noise_error")]
+            cells = [_number(each["nominal"], 4, "none")]
+            cells += [Cell(f"{x:.4g}", repr(x)) for x in (*numbers, low, high)]
             rows.append([Cell(str(each["name"])), *cells, Cell(str(each["unit"])), Cell(", ".join(notes))])
         header = ["", "nominal", "identified", "standard error", "of white noise", "95 % from", "to", "unit", ""]
         content.tables.append(Table("parameters", header, rows))

@@ -262,6 +262,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--quick", action="store_true", help="train one seed for seconds; the numbers mean little")
     parser.add_argument("--results", type=Path, help="JSON file to write the tables to")
     options = _setup.parse(parser, Path("runs/tethered-balloon"), arguments)
+    _setup.reserve(options.output, quick=options.quick)
 
     description = read_description(DESCRIPTION)
     recordings = options.output / "recordings"
