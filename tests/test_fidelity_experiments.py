@@ -38,6 +38,7 @@ SCRIPTS = {
     "fidelity_limits.py": "fidelity-limits",
     "real/compass_gait/compass_gait.py": "compass_gait",
     "real/double_pendulum/double_pendulum.py": "double_pendulum",
+    "real/double_pendulum/residuals.py": "double_pendulum_residuals",
     "real/go1/go1.py": "go1",
     "real/quadrotor/quadrotor.py": "quadrotor",
     "real/rgblimp/rgblimp.py": "rgblimp",

@@ -16,9 +16,9 @@ from ballu_mjx.identification.actuator_choice import choose_actuators
 from ballu_mjx.identification.stable_time_step import check_stability
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.residuals.dataset import USES, RecordingsData, ResidualDataset
-from ballu_mjx.residuals.envmimic import EnvMimicConfig
+from ballu_mjx.residuals.envmimic import EnvMimicConfig, resolve_envmimic
 from ballu_mjx.residuals.run_config import ResidualReference, describe_run
-from ballu_mjx.residuals.scales import describe_scales, resolve_scales
+from ballu_mjx.residuals.scales import describe_scales
 from ballu_mjx.residuals.trained_residual import TrainedResidual, describe_residual
 from ballu_mjx.rl.resume_point import ResumePoint
 from ballu_mjx.runs import loggers
@@ -108,11 +108,11 @@ def train_residual(
 
 
 def settle(env: EnvMimicConfig, prepared: Prepared, *, first: bool = True) -> EnvMimicConfig:
-    """Return the network's options with numbers for scales, limit and cost, and print these.
+    """Return the network's options with numbers where they depend on the robot or the recordings, and print scales.
 
-    **Raises** `InputError` from `scales.resolve_scales`.
+    **Raises** `InputError` from `envmimic.resolve_envmimic`.
     """
-    settled = resolve_scales(env, prepared.improved, prepared.motions["training"])
+    settled = resolve_envmimic(env, prepared.improved, prepared.motions["training"])
     if first:
         print(describe_scales(settled, prepared.dataset.robot), flush=True)
     return settled

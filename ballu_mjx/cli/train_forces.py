@@ -10,7 +10,7 @@ from typing import Any
 from ballu_mjx.cli._command import TrainCommand, load_chosen_robot
 from ballu_mjx.cli._residual import Prepared, settle, train_residual
 from ballu_mjx.residuals.dataset import RecordingsData
-from ballu_mjx.residuals.force_gradients import AnalyticConfig, check_analytic_config
+from ballu_mjx.residuals.force_gradients import AnalyticConfig, check_analytic_config, resolve_windows
 from ballu_mjx.residuals.force_regression import SupervisedConfig, check_supervised_config
 from ballu_mjx.residuals.force_training import fit_analytic, fit_supervised, network_sections
 from ballu_mjx.residuals.run_config import ResidualReference
@@ -56,6 +56,7 @@ def train_supervised(data: ForcesData, fit: SupervisedConfig) -> int:
 def train_analytic(data: ForcesData, fit: AnalyticConfig) -> int:
     """Read and check all inputs, learn, evaluate the result, and return the exit status."""
     robot = _robot(data)
+    fit = resolve_windows(fit, robot)
     check_analytic_config(fit, robot.control_timestep)
     return _train("analytic", data, fit, fit_analytic, robot)
 

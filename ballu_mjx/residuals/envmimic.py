@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import math
+import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, cast
 
@@ -74,8 +75,10 @@ class EnvMimicConfig(ForceNetworkConfig):
     force_cost: float | None = None
     """Cost of force, in reward per N^2. Without this option: 0.05 per squared unit of the network's
     output."""
-    episode_seconds: float = 3.0
-    """Mean length of an episode, s. An episode also ends at the end of its recording."""
+    episode_seconds: float | None = None
+    """Mean length of an episode, s. An episode also ends at the end of its recording. Without this option: 3 s, or the
+    middle one of the robot's declared horizons if this is shorter. Errors that saturate within an episode do not show
+    which force is better."""
     episode_spread: float = 0.5
     """Half the range of episode lengths, as a fraction of the mean length (0 to 1). Lengths are drawn uniformly. With
     0, robots that are reset together stay in phase, and every batch shows only one phase of the episode."""
@@ -87,6 +90,26 @@ class EnvMimicConfig(ForceNetworkConfig):
     start_noise: float = 1.0
     """Perturbation of the starting state, in multiples of the uncertainty of the reconstruction from motion capture
     (1 mm and 0.5 deg; 1 cm/s, 2 deg/s for the base and 5 deg/s for joints)."""
+
+
+_EPISODE_SECONDS = 3.0
+"""Default mean length of an episode (s) for a robot that does not declare a shorter horizon."""
+
+
+def resolve_envmimic(
+    config: EnvMimicConfig, simulator: Simulator | AugmentedSimulator, motions: Sequence[Motion]
+) -> EnvMimicConfig:
+    """Return the options with numbers for the length of episodes and for all scales (`scales.resolve_scales`).
+
+    `motions` are the training motions.
+
+    **Raises** `InputError` from `resolve_scales`.
+    """
+    if config.episode_seconds is None:
+        declared = simulator.robot.horizons
+        seconds = min(_EPISODE_SECONDS, statistics.median_low(declared)) if declared else _EPISODE_SECONDS
+        config = dataclasses.replace(config, episode_seconds=seconds)
+    return resolve_scales(config, simulator, motions)
 
 
 def check_envmimic_config(config: EnvMimicConfig, control_timestep: float) -> None:
@@ -185,14 +208,15 @@ class EnvMimicEnv(Env):
         If `simulator` has a residual, that residual also acts, and the policy learns the remaining forces.
         """
         self.simulator = simulator.with_residual(None)
-        self.config = resolve_scales(config, self.simulator, motions)
+        self.config = resolve_envmimic(config, self.simulator, motions)
         plain = self.simulator.simulator
         model, self.robot = plain.mj_model, plain.robot
         self._held = np.array([model.joint(name).dofadr[0] for name in self.robot.held], int)
         self._spread_of_starts = jnp.asarray(start_spread(model, self.robot), jnp.float32)
         reference, _ = stack_motions(plain, motions)
         self.reference = pad_to_bucket(reference)
-        self.episode_length = round(config.episode_seconds / self.robot.control_timestep)
+        assert self.config.episode_seconds is not None, "Resolved."
+        self.episode_length = round(self.config.episode_seconds / self.robot.control_timestep)
         self.recorded_inputs = recorded_inputs(reference, config, self.robot)
         self.mirror = network_mirror(self.config, self.robot)
         self.observed = TrainingRange.of(self.recorded_inputs, self.mirror)
@@ -267,7 +291,7 @@ class EnvMimicEnv(Env):
         target = self.reference.features[recording, time + 1]
         rollout, finite = after.keep_finite(before.rollout, target)
         terms = reward_terms(rollout.features, target, self.config, self.robot.upright)
-        assert self.config.force_cost is not None, "Settled."
+        assert self.config.force_cost is not None, "Resolved."
         cost = self.config.force_cost * square_newtons(loads - expected, self.config, self.robot)
         reward = jnp.where(finite, terms["tracking"] - cost, 0.0)
 

@@ -10,11 +10,10 @@ import jax
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.evaluation.open_loop import Evaluators
 from ballu_mjx.recordings.motion import Motion
-from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv, check_envmimic_config
+from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv, check_envmimic_config, resolve_envmimic
 from ballu_mjx.residuals.network import NetworkResidual
 from ballu_mjx.residuals.network_input import num_inputs
 from ballu_mjx.residuals.network_loads import num_loads
-from ballu_mjx.residuals.scales import resolve_scales
 from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.residuals.training_range import with_fading
 from ballu_mjx.rl import ppo
@@ -69,7 +68,7 @@ def train_envmimic(
     plain, robot = augmented.without_residual(), augmented.robot
     check_envmimic_options(config, ppo_config, validate_every, robot.control_timestep)
     check_resumes(start, config, robot)
-    config = resolve_scales(config, augmented, motions)
+    config = resolve_envmimic(config, augmented, motions)
     sections = {"env": dataclasses.asdict(config), "ppo": dataclasses.asdict(ppo_config)}
     record = MemoryRecord(sections) if run is None else run
     env = EnvMimicEnv(augmented, motions, config)

@@ -37,10 +37,11 @@ from ballu_mjx.sim.simulator import AugmentedSimulator, RolloutState
 class AnalyticConfig:
     """Options of learning by gradients through the simulation."""
 
-    window_seconds: float = 8.0
-    """Length of a window, s."""
-    interval_seconds: float = 8.0
-    """Time between the starts of two windows, s."""
+    window_seconds: float | None = None
+    """Length of a window, s. Without this option: 8 s, or the longest of the robot's declared horizons if this is
+    shorter. Errors that saturate within a window have no useful gradient."""
+    interval_seconds: float | None = None
+    """Time between the starts of two windows, s. Without this option: the length of a window."""
     relinearizations: int = 8
     """Number of simulations. Each simulation is followed by a linearization and `updates` gradient steps."""
     windows: int = 16
@@ -68,11 +69,24 @@ class AnalyticConfig:
     """Seed of the network's initial parameters, of the choice of windows, and of the noise."""
 
 
+_WINDOW_SECONDS = 8.0
+"""Default length of a window (s) for a robot that does not declare shorter horizons."""
+
+
+def resolve_windows(config: AnalyticConfig, robot: RobotDescription) -> AnalyticConfig:
+    """Return the options with numbers for the windows' length and interval."""
+    longest = max(robot.horizons, default=_WINDOW_SECONDS)
+    window = min(_WINDOW_SECONDS, longest) if config.window_seconds is None else config.window_seconds
+    interval = window if config.interval_seconds is None else config.interval_seconds
+    return dataclasses.replace(config, window_seconds=window, interval_seconds=interval)
+
+
 def check_analytic_config(config: AnalyticConfig, control_timestep: float) -> None:
-    """Check options for a robot with a control step of `control_timestep` (s).
+    """Check resolved options for a robot with a control step of `control_timestep` (s).
 
     **Raises** `InputError` for an option out of range. The message names it.
     """
+    assert config.window_seconds is not None and config.interval_seconds is not None, "Resolved."
     check_motion_windows(config.window_seconds, config.interval_seconds, control_timestep)
     positive = "relinearizations", "windows", "updates", "validate_every", "learning_rate", "max_grad_norm", "averaging"
     for name in positive:

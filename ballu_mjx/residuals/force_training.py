@@ -18,14 +18,14 @@ from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.motion_windows import cut_motion_windows
 from ballu_mjx.recordings.reference import stack_motions
 from ballu_mjx.residuals import force_gradients, force_regression
-from ballu_mjx.residuals.envmimic import EnvMimicConfig
+from ballu_mjx.residuals.envmimic import EnvMimicConfig, resolve_envmimic
 from ballu_mjx.residuals.force_gradients import AnalyticConfig
 from ballu_mjx.residuals.force_regression import SupervisedConfig
 from ballu_mjx.residuals.network import NetworkResidual
 from ballu_mjx.residuals.network_input import recorded_inputs
 from ballu_mjx.residuals.network_loads import expected_units, num_loads
 from ballu_mjx.residuals.network_mirror import network_mirror
-from ballu_mjx.residuals.scales import missing_loads, resolve_scales
+from ballu_mjx.residuals.scales import missing_loads
 from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.residuals.training_range import TrainingRange, with_fading
 from ballu_mjx.rl import ppo
@@ -89,7 +89,7 @@ def fit_analytic(
 
     `config` has the options of this method. The other arguments and the errors are those of `fit_supervised`.
     """
-    config = config or AnalyticConfig()
+    config = force_gradients.resolve_windows(config or AnalyticConfig(), simulator.robot)
     force_gradients.check_analytic_config(config, simulator.robot.control_timestep)
     uses = _Uses(motions, motions if validation is None else validation)
     return _fit(_Analytic, "analytic", simulator, uses, config, forces, run, progress, evaluators)
@@ -255,6 +255,7 @@ class _Analytic(_Fit):
         """Fit the network by gradients through the simulation, with open-loop validations."""
         setup, config = self.setup, self.config
         assert isinstance(config, AnalyticConfig)
+        assert config.window_seconds is not None and config.interval_seconds is not None, "Resolved."
         cut = cut_motion_windows(
             setup.simulator.simulator, setup.motions.training, config.window_seconds, config.interval_seconds
         )
@@ -309,7 +310,7 @@ def _fit(
     plain, robot = augmented.without_residual(), augmented.robot
     record = MemoryRecord({"fit": dataclasses.asdict(config)}) if run is None else run
     env, network = network_sections(forces, config.seed)
-    env = resolve_scales(env, augmented, motions.training)
+    env = resolve_envmimic(env, augmented, motions.training)
     reference, _ = stack_motions(plain, motions.training)
     inputs = np.asarray(recorded_inputs(reference, env, robot))
     mirror = network_mirror(env, robot)

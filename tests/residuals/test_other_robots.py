@@ -23,8 +23,8 @@ from ballu_mjx.recordings.reference import stack_motions
 from ballu_mjx.residuals import force_gradients, force_regression
 from ballu_mjx.residuals.aerodynamics import Aerodynamics, AirParameters
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, identify_air
-from ballu_mjx.residuals.envmimic import EnvMimicConfig, start_spread
-from ballu_mjx.residuals.force_gradients import AnalyticConfig
+from ballu_mjx.residuals.envmimic import EnvMimicConfig, resolve_envmimic, start_spread
+from ballu_mjx.residuals.force_gradients import AnalyticConfig, resolve_windows
 from ballu_mjx.residuals.force_regression import SupervisedConfig
 from ballu_mjx.residuals.force_training import fit_analytic, fit_supervised, resolve_joint_spreads
 from ballu_mjx.residuals.network import NetworkResidual
@@ -73,10 +73,9 @@ def test_gradients_through_the_simulation_recover_a_known_force(motions: list[Mo
     forces = NetworkResidual(CONFIG, ROBOT, ppo.make_inference(*sizes), name="analytic")
     start = ppo.initial_policy(inputs, num_loads(CONFIG, ROBOT), NETWORK)
     settings = AnalyticConfig(
-        window_seconds=0.5, interval_seconds=0.5, relinearizations=2, updates=150, validate_every=150,
-        observation_noise=0.0, start_noise=0.0,
+        relinearizations=2, updates=150, validate_every=150, observation_noise=0.0, start_noise=0.0,
     )  # fmt: skip
-    windows = cut_motion_windows(SIMULATOR, motions, settings.window_seconds, settings.interval_seconds)
+    windows = cut_motion_windows(SIMULATOR, motions, 0.5, 0.5)
     found = []
     force_gradients.train(
         forces,
@@ -94,6 +93,25 @@ def test_gradients_through_the_simulation_recover_a_known_force(motions: list[Mo
     # A force along the taut tether does not move the balloon, so only the horizontal force can be identified.
     np.testing.assert_allclose(found_push[:2], PUSH[:2], atol=0.05 * float(np.linalg.norm(PUSH)))
     assert metrics["loss"] < 0.1 * found[0][1]["loss"]
+
+
+@pytest.mark.parametrize(
+    ("horizons", "episode", "window"),
+    [((), 3.0, 8.0), ((0.2, 0.4, 1.0), 0.4, 1.0), ((0.5, 1.0), 0.5, 1.0), ((5.0, 10.0, 20.0), 3.0, 8.0)],
+)
+def test_robots_with_short_horizons_learn_from_short_motions(
+    horizons: tuple[float, ...], episode: float, window: float
+):
+    """On a robot whose errors saturate after a second, episodes of 3 s do not show which force is better."""
+    robot = dataclasses.replace(ROBOT, horizons=horizons)
+    given = dataclasses.replace(CONFIG, expected_loads=(0.0,))
+    assert resolve_envmimic(given, Simulator(robot), []).episode_seconds == episode
+    long = dataclasses.replace(given, episode_seconds=4.0)
+    assert resolve_envmimic(long, Simulator(robot), []).episode_seconds == 4.0
+    found = resolve_windows(AnalyticConfig(), robot)
+    assert (found.window_seconds, found.interval_seconds) == (window, window)
+    chosen = resolve_windows(AnalyticConfig(window_seconds=0.5, interval_seconds=0.25), robot)
+    assert (chosen.window_seconds, chosen.interval_seconds) == (0.5, 0.25)
 
 
 def position_errors(learned: TrainedResidual, motions: list[Motion]) -> tuple[float, float]:

@@ -22,7 +22,7 @@ from ballu_mjx.recordings.motion_windows import MotionWindows, cut_motion_window
 from ballu_mjx.recordings.reference import stack_motions
 from ballu_mjx.residuals import force_gradients, force_regression
 from ballu_mjx.residuals.envmimic import EnvMimicConfig
-from ballu_mjx.residuals.force_gradients import AnalyticConfig, check_analytic_config
+from ballu_mjx.residuals.force_gradients import AnalyticConfig, check_analytic_config, resolve_windows
 from ballu_mjx.residuals.force_regression import SupervisedConfig, check_supervised_config
 from ballu_mjx.residuals.network import NetworkResidual
 from ballu_mjx.residuals.network_input import num_inputs, recorded_inputs
@@ -317,7 +317,7 @@ def test_a_step_that_diverges_leaves_the_other_labels_finite(motions: list[Motio
 def test_options_out_of_range_are_refused(config: AnalyticConfig | SupervisedConfig, message: str):
     with pytest.raises(InputError, match=message):
         if isinstance(config, AnalyticConfig):
-            check_analytic_config(config, 0.05)
+            check_analytic_config(resolve_windows(config, BALLU), 0.05)
         else:
             check_supervised_config(config)
 

@@ -70,8 +70,13 @@ def load(data: Path, names: tuple[str, ...]) -> list[MeasuredMotion]:
 
 
 def load_swing_ups(data: Path) -> list[MeasuredMotion]:
-    """Read and measure the swing-ups of the acrobot under the controller `ilqr_tvlqr_lqr`, if there are any."""
-    return read(sorted(data.glob("acrobot-ilqr_tvlqr_lqr-experiment*.csv.gz")))
+    """Read and measure the swing-ups, if there are any."""
+    return read(swing_ups(data))
+
+
+def swing_ups(data: Path) -> list[Path]:
+    """Return the recorded swing-ups of the acrobot under the controller `ilqr_tvlqr_lqr`."""
+    return sorted(data.glob("acrobot-ilqr_tvlqr_lqr-experiment*.csv.gz"))
 
 
 def read(paths: list[Path]) -> list[MeasuredMotion]:

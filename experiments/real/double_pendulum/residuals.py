@@ -1,0 +1,211 @@
+# %% [markdown]
+# # Residual torques at the joints of a real double pendulum
+#
+# The residual methods learn what the model of `double_pendulum.py` lacks, as torques along both joints
+# (`--forces joints`), from the same six recordings. The validation recordings choose checkpoints. Nothing tells the
+# methods that friction is missing. Identification of declared parameters, and the friction of the data's authors, are
+# the comparison. EnvMimic also learns what the identified model lacks. The header of `double_pendulum.py` names the
+# data.
+#
+# Run `python experiments/real/double_pendulum/residuals.py --data FOLDER`. `--quick` is a short trial run.
+
+# %%
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+FOLDER = Path("experiments/real/double_pendulum") if "ipykernel" in sys.modules else Path(__file__).parent
+sys.path[1:1] = [str(FOLDER), str(FOLDER.parent), str(FOLDER.parents[1])]
+
+import _setup
+
+_setup.prepare()
+
+import argparse
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import _fit
+import double_pendulum
+import jax.numpy as jnp
+import numpy as np
+from _constant_wrench import ConstantWrench
+from jaxtyping import Float
+
+from ballu_mjx.common.results import Cell, Table
+from ballu_mjx.evaluation.open_loop import Evaluators, OpenLoopEvaluator, Replay
+from ballu_mjx.identification.parameters import IdentifiedParameters
+from ballu_mjx.recordings.csv_format import read_recording
+from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.recordings.reconstruct import reconstruct_for_simulator
+from ballu_mjx.residuals.envmimic import EnvMimicConfig
+from ballu_mjx.residuals.envmimic_training import train_envmimic
+from ballu_mjx.residuals.force_gradients import AnalyticConfig
+from ballu_mjx.residuals.force_regression import SupervisedConfig
+from ballu_mjx.residuals.force_training import fit_analytic, fit_supervised
+from ballu_mjx.residuals.trained_residual import TrainedResidual
+from ballu_mjx.rl.ppo import PPOConfig
+from ballu_mjx.robots.description import read_description
+from ballu_mjx.runs.progress import PhaseProgress, Progress
+from ballu_mjx.sim.residual import Residual
+from ballu_mjx.sim.simulator import Simulator
+
+NAMES = {
+    "training": double_pendulum.TRAINING,
+    "validation": double_pendulum.VALIDATION,
+    "test": double_pendulum.TEST,
+}
+"""Times in the names of recordings, by use."""
+METHODS = {
+    "nominal": ("supervised", "analytic", "envmimic"),
+    "published friction": (),
+    "identified": ("envmimic",),
+}
+"""Methods that learn what the model lacks, by values of its parameters."""
+LABELS = {"supervised": "supervised", "analytic": "analytic", "envmimic": "EnvMimic"}
+"""Names of the methods in the tables."""
+QUICK = PPOConfig(num_timesteps=4000, num_envs=16, batch_size=16, num_minibatches=4)
+"""Options of EnvMimic for a training that takes seconds."""
+
+
+Motions = Mapping[str, Sequence[Motion]]
+"""Reconstructed recordings by use."""
+
+
+def load(data: Path, simulator: Simulator, *, quick: bool) -> dict[str, list[Motion]]:
+    """Reconstruct the recordings by use, with the drivetrain of `simulator`. `quick` takes one of each."""
+    files = {use: [data / f"sysid-20230629-{name}.csv.gz" for name in names] for use, names in NAMES.items()}
+    files["swing-ups"] = double_pendulum.swing_ups(data)
+    few = slice(1) if quick else slice(None)
+    return {
+        use: [reconstruct_for_simulator(read_recording(path, simulator.robot), simulator) for path in paths[few]]
+        for use, paths in files.items()
+        if paths
+    }
+
+
+def learn(method: str, simulator: Simulator, motions: Motions, seed: int, *, quick: bool) -> TrainedResidual:
+    """Learn torques along the joints by a method of `METHODS`. `quick` learns for seconds."""
+    training, validation = motions["training"], motions["validation"]
+    if method == "envmimic":
+        ppo = dataclasses.replace(QUICK if quick else PPOConfig(), seed=seed)
+        config, progress = EnvMimicConfig(forces="joints"), Progress(ppo.num_timesteps)
+        found = train_envmimic(simulator, training, config, ppo, validation=validation, progress=progress)
+        progress.close()
+        return found
+    progress = PhaseProgress()
+    if method == "supervised":
+        config = SupervisedConfig(seed=seed, updates=50, validate_every=50) if quick else SupervisedConfig(seed=seed)
+        return fit_supervised(simulator, training, config, forces="joints", validation=validation, progress=progress)
+    config = AnalyticConfig(seed=seed, relinearizations=1, windows=2) if quick else AnalyticConfig(seed=seed)
+    return fit_analytic(simulator, training, config, forces="joints", validation=validation, progress=progress)
+
+
+# %% [markdown]
+# ## Errors
+
+
+# %%
+Angles = tuple[Float[np.ndarray, "starts joints"], Float[np.ndarray, "starts joints"]]
+"""Recorded and simulated joint angles (rad). Simulated ones are NaN if the simulation diverged."""
+
+
+def end_angles(evaluator: OpenLoopEvaluator, replay: Replay, horizon: float) -> Angles:
+    """Return the joint angles of a replay at the end of a horizon (s), for starts with that much recording."""
+    steps = round(horizon / evaluator.robot.control_timestep)
+    recorded, simulated = [], []
+    for run, (number, start) in enumerate(evaluator.starts):
+        qpos = evaluator.motions[number].qpos
+        if start + steps < len(qpos):
+            recorded.append(qpos[start + steps])
+            simulated.append(replay.joints[run, steps])
+    return np.array(recorded, float), np.array(simulated, float)
+
+
+def median_errors(angles: Angles) -> tuple[float, ...]:
+    """Return the median absolute errors (deg) of shoulder and elbow. Simulations that diverged count as infinite."""
+    recorded, simulated = angles
+    errors = np.abs(np.rad2deg(simulated - recorded))
+    return tuple(np.median(np.where(np.isfinite(errors), errors, np.inf), axis=0).tolist())
+
+
+def tip_errors(angles: Angles) -> tuple[float, ...]:
+    """Return median and 90th percentile of the tip's distance (m). Simulations that diverged count as infinite."""
+    recorded, simulated = map(double_pendulum.tip, angles)
+    distance = np.linalg.norm(simulated - recorded, axis=1)
+    return tuple(np.percentile(np.where(np.isfinite(distance), distance, np.inf), [50, 90]).tolist())
+
+
+Found = dict[str, tuple[float, ...]]
+"""Errors of one simulator, by table and group."""
+
+
+def errors_of(evaluators: Evaluators, residual: Residual, params: Any, motions: Motions) -> Found:
+    """Return the errors of a simulator with a residual."""
+    found = {}
+    for group in (use for use in motions if use != "training"):
+        evaluator = evaluators.of(residual, motions[group])
+        replay = evaluator.replay(params, seconds=double_pendulum.HORIZONS[-1])
+        if group == "swing-ups":
+            found[group] = tip_errors(end_angles(evaluator, replay, double_pendulum.SWING_UP_HORIZON))
+            continue
+        for horizon in double_pendulum.HORIZONS:
+            found[f"{group}, {horizon:g} s"] = median_errors(end_angles(evaluator, replay, horizon))
+    return found
+
+
+def tables(rows: Mapping[str, Sequence[Found]]) -> dict[str, Table]:
+    """Return the tables. `rows` holds the errors of each simulator, one for each seed."""
+
+    def cells(key: str, form: str) -> dict[str, list[Cell]]:
+        return {
+            name: [Cell(values, form) for values in zip(*(found[key] for found in runs), strict=True)]
+            for name, runs in rows.items()
+        }
+
+    known = next(iter(rows.values()))[0]
+    made = {}
+    for horizon in double_pendulum.HORIZONS:
+        sides = [cells(f"{group}, {horizon:g} s", ".2f") for group in ("validation", "test")]
+        heads = [f"{group}: {joint} (deg)" for group in ("validation", "test") for joint in ("shoulder", "elbow")]
+        made[f"after_{1000 * horizon:.0f}_ms"] = Table(
+            (f"after {horizon:g} s", *heads), tuple((name, *sides[0][name], *sides[1][name]) for name in rows)
+        )
+    if "swing-ups" in known:
+        found = cells("swing-ups", ".4f")
+        heads = f"swing-ups: tip after {double_pendulum.SWING_UP_HORIZON:g} s", "median (m)", "90th percentile (m)"
+        made["swing_ups"] = Table(heads, tuple((name, *found[name]) for name in rows))
+    return made
+
+
+# %%
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Learn torques at the joints of a double pendulum by three methods.")
+    parser.add_argument("--data", type=Path, required=True, help="folder of the recordings")
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="training seeds (0 1 2)")
+    parser.add_argument("--quick", action="store_true", help="few recordings and steps; the numbers mean little")
+    parser.add_argument("--results", type=Path, help="JSON file to write the tables to")
+    options = _setup.parse(parser, Path("runs/double_pendulum_residuals"))
+    quick, seeds = options.quick, options.seeds[:1] if options.quick else options.seeds
+    robot = read_description(FOLDER / "double_pendulum.robot.json")
+    fit = double_pendulum.identify(options.data, quick=quick)
+    vectors = _fit.candidates(fit, double_pendulum.PUBLISHED)
+    rows: dict[str, list[Found]] = {}
+    for name, vector in vectors.items():
+        actuators = None if name == "nominal" else IdentifiedParameters(jnp.asarray(vector), fit.parameters)
+        simulator = Simulator(robot, actuators)
+        motions, evaluators = load(options.data, simulator, quick=quick), Evaluators(simulator)
+        nothing = ConstantWrench(anchored=robot.anchored), jnp.zeros(6)
+        rows[name] = [errors_of(evaluators, *nothing, motions)]
+        for method in METHODS[name]:
+            label = LABELS[method] if name == "nominal" else f"{name}, then {LABELS[method]}"
+            print(f"{label}:", flush=True)
+            learned = [learn(method, simulator, motions, seed, quick=quick) for seed in seeds]
+            rows[label] = [errors_of(evaluators, each.model, each.params, motions) for each in learned]
+    _setup.write_tables(tables(rows), options.output, options.results, {"training": seeds})
+
+
+if __name__ == "__main__":
+    _setup.run(main)
