@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from ballu_mjx.policies.training import locomotion_ppo, train_policy
     from ballu_mjx.recordings.load import load_recordings
     from ballu_mjx.recordings.motion import Motion
-    from ballu_mjx.recordings.reconstruct import reconstruct
+    from ballu_mjx.recordings.reconstruct import reconstruct, reconstruct_for_simulator
     from ballu_mjx.recordings.recording import Recording
     from ballu_mjx.residuals.aerodynamics_fit import AirConfig
     from ballu_mjx.residuals.aerodynamics_training import fit_aerodynamics
@@ -89,6 +89,7 @@ _MODULES = {
     "load_simulator": "policies.load_simulator",
     "locomotion_ppo": "policies.training",
     "reconstruct": "recordings.reconstruct",
+    "reconstruct_for_simulator": "recordings.reconstruct",
     "train_envmimic": "residuals.envmimic_training",
     "train_policy": "policies.training",
 }
@@ -132,6 +133,7 @@ __all__ = [
     "load_simulator",
     "locomotion_ppo",
     "reconstruct",
+    "reconstruct_for_simulator",
     "train_envmimic",
     "train_policy",
 ]

@@ -1,0 +1,80 @@
+"""The defaults of the residual methods on robots for which they were not chosen, with forces that are known."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import mujoco
+import numpy as np
+import pytest
+from experiment_modules import EXPERIMENTS, experiment_module
+
+from ballu_mjx.evaluation.open_loop import evaluate
+from ballu_mjx.recordings.csv_format import list_recordings, read_recording
+from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.recordings.reconstruct import reconstruct_for_simulator
+from ballu_mjx.residuals.envmimic_training import train_envmimic
+from ballu_mjx.residuals.force_training import fit_analytic
+from ballu_mjx.rl.ppo import PPOConfig
+from ballu_mjx.robots.description import RobotDescription, read_description
+from ballu_mjx.sim.simulator import Simulator
+
+pytestmark = pytest.mark.slow
+
+FRICTION = 0.25, 0.19
+"""Dry friction of shoulder and elbow (N m), which the pendulum's model lacks."""
+
+
+@pytest.fixture(scope="module")
+def tethered() -> Iterator[ModuleType]:
+    with experiment_module(EXPERIMENTS / "tethered_balloon" / "tethered_balloon.py") as module:
+        yield module
+
+
+def swing(robot: RobotDescription, seed: int, steps: int = 300) -> Motion:
+    """Simulate the double pendulum with friction in C MuJoCo, under random torques."""
+    model, rng = robot.load_model(), np.random.default_rng(seed)
+    model.dof_frictionloss[:] = FRICTION
+    model.opt.iterations = 50
+    data = mujoco.MjData(model)
+    data.qpos[:] = rng.uniform(-0.5, 0.5, 2)
+    command = 0.5 + 0.03 * np.repeat(rng.uniform(-1, 1, (steps // 20, 2)), 20, axis=0)
+    qpos, qvel = [data.qpos.copy()], [data.qvel.copy()]
+    for now in command:
+        data.ctrl[:] = now
+        mujoco.mj_step(model, data, round(robot.control_timestep / model.opt.timestep))
+        qpos.append(data.qpos.copy())
+        qvel.append(data.qvel.copy())
+    time = np.arange(steps + 1) * robot.control_timestep
+    return Motion(f"swing-{seed}", time, command, np.array(qpos), np.array(qvel), {})
+
+
+def test_envmimic_learns_the_wind_on_a_tethered_balloon(tethered: ModuleType, tmp_path: Path):
+    robot = read_description(tethered.DESCRIPTION)
+    tethered.record_all(robot, tmp_path, quick=False)
+    simulator = Simulator(robot)
+    motions = {
+        use: [
+            reconstruct_for_simulator(read_recording(path, robot), simulator)
+            for path in list_recordings([tmp_path / use])
+        ]
+        for use in ("training", "validation")
+    }
+    learned = train_envmimic(
+        simulator,
+        motions["training"],
+        ppo_config=PPOConfig(num_timesteps=1_200_000),
+        validation=motions["validation"],
+        validate_every=200_000,
+    )
+    assert evaluate(simulator.with_residual(learned), motions["validation"]).score < 0.5
+
+
+def test_gradients_learn_the_friction_of_a_double_pendulum():
+    robot = read_description(EXPERIMENTS / "real" / "double_pendulum" / "double_pendulum.robot.json")
+    simulator = Simulator(robot)
+    motions = [swing(robot, seed) for seed in range(8)]
+    learned = fit_analytic(simulator, motions[:6], forces="joints", validation=motions[6:])
+    assert evaluate(simulator.with_residual(learned), motions[6:]).score < 0.5
