@@ -79,8 +79,7 @@ def train(task: Task, data: Data, env: LocomotionConfig, ppo: PPOConfig) -> int:
     robot = load_chosen_robot(data.robot, data.resume, task.name, data.residual)
     check_task(task, robot)
     check_policy_options(env, ppo, data.keep_every, robot)
-    identified, reference = _parts(task, data, robot)
-    residual = None if reference is None else TrainedResidual.load_reference(reference, robot)
+    identified, residual, reference = _parts(task, data, robot)
     where = None if reference is None else reference.folder
     check_belongs(residual, identified, where)
     simulator = Simulator(robot, identified).with_residual(None if residual is None else residual.bound)
@@ -159,8 +158,11 @@ def summary(task: Task, rollout: Rollout, robot: RobotDescription, with_residual
     return text
 
 
-def _parts(task: Task, data: Data, robot: RobotDescription) -> tuple[ModelParameters | None, ResidualReference | None]:
-    """Return the actuators (None if nominal) and the residual (None if there is none)."""
+def _parts(
+    task: Task, data: Data, robot: RobotDescription
+) -> tuple[ModelParameters | None, TrainedResidual | None, ResidualReference | None]:
+    """Return the actuators (None if nominal), the residual (None if there is none), and where it is stored."""
+    stored = None
     if data.resume is not None:
         chosen = None if data.actuators == AUTO else data.actuators
         for option, given in (("--actuators", chosen), ("--residual", data.residual)):
@@ -168,14 +170,16 @@ def _parts(task: Task, data: Data, robot: RobotDescription) -> tuple[ModelParame
                 raise InputError(
                     f"{option} does not go with --resume, which keeps the simulator; leave out one of them."
                 )
-        stored = read_config(data.resume, task.name)
-        return run_actuators(stored, data.resume, robot), run_residual(stored, data.resume)
-    residual = ResidualReference.chosen(data.residual)
-    if data.actuators == NOMINAL:
-        return None, residual
-    if data.actuators != AUTO:
-        return read_actuators(robot, data.actuators)[1], residual
-    return None if residual is None else TrainedResidual.load_reference(residual, robot).actuators, residual
+        stored = read_config(data.resume, task.name), data.resume
+    reference = ResidualReference.chosen(data.residual) if stored is None else run_residual(*stored)
+    residual = None if reference is None else TrainedResidual.load_reference(reference, robot)
+    if stored is not None:
+        actuators = run_actuators(*stored, robot)
+    elif data.actuators == AUTO:
+        actuators = None if residual is None else residual.actuators
+    else:
+        actuators = None if data.actuators == NOMINAL else read_actuators(robot, data.actuators)[1]
+    return actuators, residual, reference
 
 
 def command_for(task: Task) -> TrainCommand:
