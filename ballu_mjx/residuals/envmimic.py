@@ -106,8 +106,9 @@ def resolve_envmimic(
     **Raises** `InputError` from `resolve_scales`.
     """
     if config.episode_seconds is None:
-        declared = simulator.robot.horizons
-        seconds = min(_EPISODE_SECONDS, statistics.median_low(declared)) if declared else _EPISODE_SECONDS
+        robot = simulator.robot
+        middle = statistics.median_low(robot.horizons or (_EPISODE_SECONDS,))
+        seconds = max(min(_EPISODE_SECONDS, middle), 2 * robot.control_timestep)
         config = dataclasses.replace(config, episode_seconds=seconds)
     return resolve_scales(config, simulator, motions)
 

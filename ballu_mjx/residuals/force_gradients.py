@@ -75,8 +75,10 @@ _WINDOW_SECONDS = 8.0
 
 def resolve_windows(config: AnalyticConfig, robot: RobotDescription) -> AnalyticConfig:
     """Return the options with numbers for the windows' length and interval."""
-    longest = max(robot.horizons, default=_WINDOW_SECONDS)
-    window = min(_WINDOW_SECONDS, longest) if config.window_seconds is None else config.window_seconds
+    window = config.window_seconds
+    if window is None:
+        longest = max(robot.horizons, default=_WINDOW_SECONDS)
+        window = max(min(_WINDOW_SECONDS, longest), 2 * robot.control_timestep)
     interval = window if config.interval_seconds is None else config.interval_seconds
     return dataclasses.replace(config, window_seconds=window, interval_seconds=interval)
 

@@ -24,7 +24,7 @@ from ballu_mjx.residuals import force_gradients, force_regression
 from ballu_mjx.residuals.aerodynamics import Aerodynamics, AirParameters
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, identify_air
 from ballu_mjx.residuals.envmimic import EnvMimicConfig, resolve_envmimic, start_spread
-from ballu_mjx.residuals.force_gradients import AnalyticConfig, resolve_windows
+from ballu_mjx.residuals.force_gradients import AnalyticConfig, check_analytic_config, resolve_windows
 from ballu_mjx.residuals.force_regression import SupervisedConfig
 from ballu_mjx.residuals.force_training import fit_analytic, fit_supervised, resolve_joint_spreads
 from ballu_mjx.residuals.network import NetworkResidual
@@ -97,7 +97,13 @@ def test_gradients_through_the_simulation_recover_a_known_force(motions: list[Mo
 
 @pytest.mark.parametrize(
     ("horizons", "episode", "window"),
-    [((), 3.0, 8.0), ((0.2, 0.4, 1.0), 0.4, 1.0), ((0.5, 1.0), 0.5, 1.0), ((5.0, 10.0, 20.0), 3.0, 8.0)],
+    [
+        ((), 3.0, 8.0),
+        ((0.2, 0.4, 1.0), 0.4, 1.0),
+        ((0.5, 1.0), 0.5, 1.0),
+        ((5.0, 10.0, 20.0), 3.0, 8.0),
+        ((ROBOT.control_timestep,), 2 * ROBOT.control_timestep, 2 * ROBOT.control_timestep),
+    ],
 )
 def test_robots_with_short_horizons_learn_from_short_motions(
     horizons: tuple[float, ...], episode: float, window: float
@@ -110,6 +116,7 @@ def test_robots_with_short_horizons_learn_from_short_motions(
     assert resolve_envmimic(long, Simulator(robot), []).episode_seconds == 4.0
     found = resolve_windows(AnalyticConfig(), robot)
     assert (found.window_seconds, found.interval_seconds) == (window, window)
+    check_analytic_config(found, robot.control_timestep)
     chosen = resolve_windows(AnalyticConfig(window_seconds=0.5, interval_seconds=0.25), robot)
     assert (chosen.window_seconds, chosen.interval_seconds) == (0.5, 0.25)
 

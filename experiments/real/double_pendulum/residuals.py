@@ -51,6 +51,7 @@ from ballu_mjx.robots.description import read_description
 from ballu_mjx.runs.progress import PhaseProgress, Progress
 from ballu_mjx.sim.residual import Residual
 from ballu_mjx.sim.simulator import Simulator
+from ballu_mjx.viz.style import label_of
 
 NAMES = {
     "training": double_pendulum.TRAINING,
@@ -64,8 +65,6 @@ METHODS = {
     "identified": ("envmimic",),
 }
 """Methods that learn what the model lacks, by values of its parameters."""
-LABELS = {"supervised": "supervised", "analytic": "analytic", "envmimic": "EnvMimic"}
-"""Names of the methods in the tables."""
 QUICK = PPOConfig(num_timesteps=4000, num_envs=16, batch_size=16, num_minibatches=4)
 """Options of EnvMimic for a training that takes seconds."""
 
@@ -200,7 +199,7 @@ def main() -> None:
         nothing = ConstantWrench(anchored=robot.anchored), jnp.zeros(6)
         rows[name] = [errors_of(evaluators, *nothing, motions)]
         for method in METHODS[name]:
-            label = LABELS[method] if name == "nominal" else f"{name}, then {LABELS[method]}"
+            label = label_of(method) if name == "nominal" else f"{name}, then {label_of(method)}"
             print(f"{label}:", flush=True)
             learned = [learn(method, simulator, motions, seed, quick=quick) for seed in seeds]
             rows[label] = [errors_of(evaluators, each.model, each.params, motions) for each in learned]
