@@ -187,7 +187,7 @@ def test_options_and_names_are_escaped(run: Path, page: Path):
     assert not [a for tag, a in elements if tag == "img" or "onerror" in a]
     content = report_content.collect(run)
     assert HOSTILE in dict(content.facts)["robot"]
-    assert dict(dict(content.options)["env"])["episode_seconds"] == "3.0"
+    assert dict(dict(content.options)["env"])["episode_spread"] == "0.5"
 
 
 class Bomb:
