@@ -6,6 +6,7 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+from simulated_motion import simulate_motion
 
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.robots.description import RobotDescription, read_description
@@ -33,11 +34,4 @@ def flight(robot: RobotDescription = ROBOT, push: np.ndarray = PUSH, added_mass:
     data.xfrc_applied[body, :3] = push
     low, high = np.array(robot.command_ranges).T
     command = low + (high - low) * np.repeat(rng.uniform(size=(STEPS // 5, 2)), 5, axis=0)
-    qpos, qvel = [data.qpos.copy()], [data.qvel.copy()]
-    for now in command:
-        data.ctrl[:] = now
-        mujoco.mj_step(model, data, round(robot.control_timestep / model.opt.timestep))
-        qpos.append(data.qpos.copy())
-        qvel.append(data.qvel.copy())
-    time = np.arange(STEPS + 1) * robot.control_timestep
-    return Motion(f"flight-{seed}", time, command, np.array(qpos), np.array(qvel), {})
+    return simulate_motion(f"flight-{seed}", model, data, command, robot.control_timestep)

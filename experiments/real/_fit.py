@@ -15,10 +15,15 @@ from ballu_mjx.common.results import Cell, Table
 from ballu_mjx.identification.fit_robot import RobotFit
 
 
-def parse(description: str, output: Path) -> argparse.Namespace:
-    """Parse the command line, and return its options `data`, `output` (see `_setup.parse`), `quick` and `results`."""
+def parse(description: str, output: Path, *, trains: bool = False) -> argparse.Namespace:
+    """Parse the command line, and return its options `data`, `output` (see `_setup.parse`), `quick` and `results`.
+
+    An experiment that `trains` networks has `seeds`, too.
+    """
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--data", type=Path, required=True, help="folder of the recordings")
+    if trains:
+        parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="training seeds (0 1 2)")
     parser.add_argument("--quick", action="store_true", help="short trial run; the numbers mean little")
     parser.add_argument("--results", type=Path, help="JSON file to write the tables to")
     return _setup.parse(parser, output)

@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 from experiment_modules import EXPERIMENTS, experiment_module
+from simulated_motion import simulate_motion
 
 from ballu_mjx.evaluation.open_loop import evaluate
 from ballu_mjx.recordings.csv_format import list_recordings, read_recording
@@ -41,14 +42,7 @@ def swing(robot: RobotDescription, seed: int, steps: int = 300) -> Motion:
     data = mujoco.MjData(model)
     data.qpos[:] = rng.uniform(-0.5, 0.5, 2)
     command = 0.5 + 0.03 * np.repeat(rng.uniform(-1, 1, (steps // 20, 2)), 20, axis=0)
-    qpos, qvel = [data.qpos.copy()], [data.qvel.copy()]
-    for now in command:
-        data.ctrl[:] = now
-        mujoco.mj_step(model, data, round(robot.control_timestep / model.opt.timestep))
-        qpos.append(data.qpos.copy())
-        qvel.append(data.qvel.copy())
-    time = np.arange(steps + 1) * robot.control_timestep
-    return Motion(f"swing-{seed}", time, command, np.array(qpos), np.array(qvel), {})
+    return simulate_motion(f"swing-{seed}", model, data, command, robot.control_timestep)
 
 
 def test_envmimic_learns_the_wind_on_a_tethered_balloon(tethered: ModuleType, tmp_path: Path):

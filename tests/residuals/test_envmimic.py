@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from simulated_motion import simulate_motion
 
 from ballu_mjx.ballu.actuators import ActuatorParameters
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, load_model, standing_qpos
@@ -44,26 +45,11 @@ def make_motion(force: np.ndarray, name: str = "made", steps: int = STEPS) -> Mo
     model = load_model()
     data = mujoco.MjData(model)
     data.qpos[:] = standing_qpos(model)
-    balloon = model.body("balloon").id
-    substeps = round(CONTROL_TIMESTEP / model.opt.timestep)
     mujoco.mj_step(model, data, 100)
     time = np.arange(steps) * CONTROL_TIMESTEP
     command = np.stack([(time % 1.2 < 0.5), ((time + 0.6) % 1.2 < 0.5)], axis=1) * 0.9
-    qpos, qvel = [data.qpos.copy()], [data.qvel.copy()]
-    data.xfrc_applied[balloon, :3] = force
-    for step in range(steps):
-        data.ctrl[:] = command[step]
-        mujoco.mj_step(model, data, substeps)
-        qpos.append(data.qpos.copy())
-        qvel.append(data.qvel.copy())
-    return Motion(
-        name=name,
-        time=np.arange(steps + 1) * CONTROL_TIMESTEP,
-        command=command,
-        qpos=np.array(qpos),
-        qvel=np.array(qvel),
-        fit_error_mm={},
-    )
+    data.xfrc_applied[model.body("balloon").id, :3] = force
+    return simulate_motion(name, model, data, command, CONTROL_TIMESTEP)
 
 
 @pytest.fixture(scope="module")

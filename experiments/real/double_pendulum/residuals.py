@@ -22,8 +22,6 @@ import _setup
 
 _setup.prepare()
 
-import argparse
-import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -32,6 +30,7 @@ import double_pendulum
 import jax.numpy as jnp
 import numpy as np
 from _constant_wrench import ConstantWrench
+from _networks import learn_network
 from jaxtyping import Float
 
 from ballu_mjx.common.results import Cell, Table
@@ -40,15 +39,7 @@ from ballu_mjx.identification.parameters import IdentifiedParameters
 from ballu_mjx.recordings.csv_format import read_recording
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reconstruct import reconstruct_for_simulator
-from ballu_mjx.residuals.envmimic import EnvMimicConfig
-from ballu_mjx.residuals.envmimic_training import train_envmimic
-from ballu_mjx.residuals.force_gradients import AnalyticConfig
-from ballu_mjx.residuals.force_regression import SupervisedConfig
-from ballu_mjx.residuals.force_training import fit_analytic, fit_supervised
-from ballu_mjx.residuals.trained_residual import TrainedResidual
-from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.robots.description import read_description
-from ballu_mjx.runs.progress import PhaseProgress, Progress
 from ballu_mjx.sim.residual import Residual
 from ballu_mjx.sim.simulator import Simulator
 from ballu_mjx.viz.style import label_of
@@ -65,8 +56,6 @@ METHODS = {
     "identified": ("envmimic",),
 }
 """Methods that learn what the model lacks, by values of its parameters."""
-QUICK = PPOConfig(num_timesteps=4000, num_envs=16, batch_size=16, num_minibatches=4)
-"""Options of EnvMimic for a training that takes seconds."""
 
 
 Motions = Mapping[str, Sequence[Motion]]
@@ -83,23 +72,6 @@ def load(data: Path, simulator: Simulator, *, quick: bool) -> dict[str, list[Mot
         for use, paths in files.items()
         if paths
     }
-
-
-def learn(method: str, simulator: Simulator, motions: Motions, seed: int, *, quick: bool) -> TrainedResidual:
-    """Learn torques along the joints by a method of `METHODS`. `quick` learns for seconds."""
-    training, validation = motions["training"], motions["validation"]
-    if method == "envmimic":
-        ppo = dataclasses.replace(QUICK if quick else PPOConfig(), seed=seed)
-        config, progress = EnvMimicConfig(forces="joints"), Progress(ppo.num_timesteps)
-        found = train_envmimic(simulator, training, config, ppo, validation=validation, progress=progress)
-        progress.close()
-        return found
-    progress = PhaseProgress()
-    if method == "supervised":
-        config = SupervisedConfig(seed=seed, updates=50, validate_every=50) if quick else SupervisedConfig(seed=seed)
-        return fit_supervised(simulator, training, config, forces="joints", validation=validation, progress=progress)
-    config = AnalyticConfig(seed=seed, relinearizations=1, windows=2) if quick else AnalyticConfig(seed=seed)
-    return fit_analytic(simulator, training, config, forces="joints", validation=validation, progress=progress)
 
 
 # %% [markdown]
@@ -181,12 +153,8 @@ def tables(rows: Mapping[str, Sequence[Found]]) -> dict[str, Table]:
 
 # %%
 def main() -> None:
-    parser = argparse.ArgumentParser(description="Learn torques at the joints of a double pendulum by three methods.")
-    parser.add_argument("--data", type=Path, required=True, help="folder of the recordings")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="training seeds (0 1 2)")
-    parser.add_argument("--quick", action="store_true", help="few recordings and steps; the numbers mean little")
-    parser.add_argument("--results", type=Path, help="JSON file to write the tables to")
-    options = _setup.parse(parser, Path("runs/double_pendulum_residuals"))
+    description = "Learn torques at the joints of a double pendulum by three methods."
+    options = _fit.parse(description, Path("runs/double_pendulum_residuals"), trains=True)
     quick, seeds = options.quick, options.seeds[:1] if options.quick else options.seeds
     robot = read_description(FOLDER / "double_pendulum.robot.json")
     fit = double_pendulum.identify(options.data, quick=quick)
@@ -201,7 +169,8 @@ def main() -> None:
         for method in METHODS[name]:
             label = label_of(method) if name == "nominal" else f"{name}, then {label_of(method)}"
             print(f"{label}:", flush=True)
-            learned = [learn(method, simulator, motions, seed, quick=quick) for seed in seeds]
+            uses = motions["training"], motions["validation"]
+            learned = [learn_network(method, simulator, *uses, "joints", seed, quick=quick) for seed in seeds]
             rows[label] = [errors_of(evaluators, each.model, each.params, motions) for each in learned]
     _setup.write_tables(tables(rows), options.output, options.results, {"training": seeds})
 

@@ -38,7 +38,7 @@ import sys
 from pathlib import Path
 
 FOLDER = Path("experiments/real/quadrotor") if "ipykernel" in sys.modules else Path(__file__).parent
-sys.path[1:1] = [str(FOLDER.parents[1])]
+sys.path[1:1] = [str(FOLDER.parent), str(FOLDER.parents[1])]
 
 import _setup
 
@@ -54,6 +54,7 @@ from typing import NamedTuple
 
 import numpy as np
 from _constant_wrench import ConstantWrench
+from _networks import learn_network
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
@@ -65,16 +66,11 @@ from ballu_mjx.recordings.csv_format import read_recording, write_recording
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.recordings.recording import Recording
-from ballu_mjx.residuals.envmimic import EnvMimicConfig
-from ballu_mjx.residuals.envmimic_training import train_envmimic
 from ballu_mjx.residuals.fluid_fit import FluidConfig
 from ballu_mjx.residuals.fluid_training import fit_fluid
-from ballu_mjx.residuals.force_regression import SupervisedConfig
-from ballu_mjx.residuals.force_training import fit_supervised
 from ballu_mjx.residuals.trained_residual import TrainedResidual
-from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.robots.description import RobotDescription, read_description
-from ballu_mjx.runs.progress import PhaseProgress, Progress
+from ballu_mjx.runs.progress import PhaseProgress
 from ballu_mjx.sim.simulator import Simulator
 
 HORIZONS = (1.0, 2.0, 5.0)
@@ -267,23 +263,13 @@ def learn(
     quick: bool,
 ) -> TrainedResidual:
     """Learn a residual by a method of `METHODS`. `quick` learns for seconds."""
-    if method == "supervised":
-        config = SupervisedConfig(seed=seed, updates=50, validate_every=50) if quick else SupervisedConfig(seed=seed)
-        return fit_supervised(simulator, training, config, validation=validation, progress=PhaseProgress())
-    if method == "fluid":
-        # Wind adds energy to the drone, so the forces must not be passive.
-        config = FluidConfig(passive=False, window_seconds=(0.5, 2.0), windows=150)
-        if quick:
-            config = FluidConfig(passive=False, terms="linear", window_seconds=(0.5,), windows=10, steps=2)
-        return fit_fluid(simulator, training, validation, config, progress=PhaseProgress())
-    ppo = PPOConfig(seed=seed)
+    if method != "fluid":
+        return learn_network(method, simulator, training, validation, "force", seed, quick=quick)
+    # Wind adds energy to the drone, so the forces must not be passive.
+    config = FluidConfig(passive=False, window_seconds=(0.5, 2.0), windows=150)
     if quick:
-        ppo = PPOConfig(seed=seed, num_timesteps=4000, num_envs=16, batch_size=16, num_minibatches=4)
-    config = EnvMimicConfig(forces="force")
-    progress = Progress(ppo.num_timesteps)
-    found = train_envmimic(simulator, training, config, ppo, validation=validation, progress=progress)
-    progress.close()
-    return found
+        config = FluidConfig(passive=False, terms="linear", window_seconds=(0.5,), windows=10, steps=2)
+    return fit_fluid(simulator, training, validation, config, progress=PhaseProgress())
 
 
 METHODS = {"supervised": "supervised", "fluid": "fluid, `--no-passive`", "envmimic": "EnvMimic, force"}
