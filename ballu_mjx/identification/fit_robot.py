@@ -106,6 +106,7 @@ class RobotFit:
     unseen: tuple[str, ...]
     """Parameters that these recordings cannot show, according to the data check."""
     at_bounds: tuple[str, ...]
+    """Parameters that the recordings show, and whose value is at a bound."""
     scatter: Float[np.ndarray, " positions"]
     """Robust standard deviation of the remaining position errors, in units of the measurements' noise."""
     losses: Float[np.ndarray, " starts"]
@@ -266,7 +267,7 @@ def fit_robot(
         correlations=analysis.correlations,
         directions=analysis.directions,
         unseen=visibility.unseen,
-        at_bounds=parameters.at_bounds(values),
+        at_bounds=tuple(name for name in parameters.at_bounds(values) if name not in visibility.unseen),
         scatter=robust_scatter(best.residuals[..., : objective.simulator.nv]),
         losses=np.sort(losses),
         windows=windows,

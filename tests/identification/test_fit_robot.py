@@ -50,7 +50,7 @@ IDENTIFY = [
     {"actuator": "servo", "field": "kp"},
     {"body": "arm", "field": "mass", "name": "mass"},
     {"command": "elbow", "field": "delay"},
-    {"actuator": "servo", "field": "forcerange", "bounds": [5, 40], "prior": 5},
+    {"actuator": "servo", "field": "forcerange", "bounds": [5, 20], "prior": 5},
 ]
 TRUTH = {"elbow_damping": 0.12, "elbow_frictionloss": 0.08, "servo_kp": 3.2, "mass": 0.36, "elbow_delay": 0.033}
 NOISE = np.deg2rad(0.2)
@@ -164,10 +164,11 @@ def test_identified_parameters_worse_than_nominal_are_not_chosen(fit: RobotFit):
 def test_fit_names_a_torque_limit_that_no_recording_reaches(parameters: ParameterSet, fit: RobotFit):
     assert fit.unseen == ("servo_forcerange",)
     assert len(fit.unidentified) == 1 and fit.unidentified[0] == "+1.00 servo_forcerange"
-    # The parameter keeps the mean of its prior, with the prior's standard deviation.
+    # The parameter keeps the mean of its prior, with the prior's standard deviation. Its bound is no finding.
     place = parameters.names.index("servo_forcerange")
     np.testing.assert_allclose(fit.values[place], 20.0, rtol=0.02)
     np.testing.assert_allclose(fit.standard_errors[place], 5.0, rtol=0.02)
+    assert parameters.at_bounds(fit.values) == ("servo_forcerange",) and not fit.at_bounds
 
 
 @pytest.mark.slow
