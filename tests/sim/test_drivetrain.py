@@ -93,6 +93,29 @@ def test_derivatives_agree_with_finite_differences_and_exist_at_the_identity():
     np.testing.assert_allclose(at_identity[1:, 0, 4], early / STEP, atol=1e-9)
 
 
+@pytest.mark.parametrize("backlash", [0.0, 0.08])
+@pytest.mark.parametrize("delay", [0.0, 0.008])
+def test_derivatives_by_backlash_and_delay_are_those_of_larger_values_also_if_commands_are_held(
+    backlash: float, delay: float
+):
+    """Delays of whole physics steps, and outputs that rest at an end of the backlash, are kinks of the filter."""
+    commands = jnp.array(
+        [0.0, 0.0, 0.1, 0.2, 0.3, 0.3, 0.3, 0.2, 0.2, -0.1, -0.1, -0.1, 0.4, 0.4, 0.35, 0.35, 0.35, 0.1]
+    )
+
+    def filtered(values: jax.Array) -> jax.Array:
+        own = identity_drivetrain(1)._replace(backlash=values[:1], delay=values[1:])
+        return filter_commands(own, jnp.asarray(commands[:, None], float), 0.004, 5)[:, 0]
+
+    with jax.enable_x64(True):
+        values = jnp.array([backlash, delay], float)
+        jacobian = jax.jacfwd(filtered)(values)
+        for place, step in enumerate(jnp.eye(2) * 1e-7):
+            change = (filtered(values + step) - filtered(values)) / 1e-7
+            np.testing.assert_allclose(jacobian[:, place], change, atol=1e-5)
+            assert np.abs(change).max() > 0.4
+
+
 def test_drivetrains_in_a_batch_agree_with_single_ones():
     commands = jnp.asarray(wandering(), jnp.float32)
     delays = jnp.array([0.0, 0.01, 0.05])

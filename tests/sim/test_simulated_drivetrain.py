@@ -24,7 +24,7 @@ from ballu_mjx.recordings.motion_windows import cut_motion_windows, start_motion
 from ballu_mjx.recordings.reference import stack_motions
 from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv, tracking_state
 from ballu_mjx.robots.description import RobotDescription, read_description
-from ballu_mjx.sim.drivetrain import DrivetrainParameters, filter_commands, identity_drivetrain
+from ballu_mjx.sim.drivetrain import DrivetrainParameters
 from ballu_mjx.sim.linearize import ControlSteps, Linearizer
 from ballu_mjx.sim.observation import HISTORY
 from ballu_mjx.sim.residual import BoundResidual, Residual
@@ -90,29 +90,6 @@ def test_derivatives_by_drivetrain_parameters_agree_with_finite_differences(robo
             change = np.asarray(both(whole[places] + step)[1] - both(whole[places] - step)[1]) / 2e-6
             np.testing.assert_allclose(jacobian[:, place], change, atol=0.01, rtol=0.02)
             assert np.abs(jacobian[:, place]).max() > 0.03
-
-
-@pytest.mark.parametrize("backlash", [0.0, 0.08])
-@pytest.mark.parametrize("delay", [0.0, 0.008])
-def test_derivatives_by_backlash_and_delay_are_those_of_larger_values_also_if_commands_are_held(
-    backlash: float, delay: float
-):
-    """Delays of whole physics steps, and outputs that rest at an end of the backlash, are kinks of the filter."""
-    commands = jnp.array(
-        [0.0, 0.0, 0.1, 0.2, 0.3, 0.3, 0.3, 0.2, 0.2, -0.1, -0.1, -0.1, 0.4, 0.4, 0.35, 0.35, 0.35, 0.1]
-    )
-
-    def filtered(values: Array) -> Array:
-        own = identity_drivetrain(1)._replace(backlash=values[:1], delay=values[1:])
-        return filter_commands(own, jnp.asarray(commands[:, None], float), 0.004, 5)[:, 0]
-
-    with jax.enable_x64(True):
-        values = jnp.array([backlash, delay], float)
-        jacobian = jax.jacfwd(filtered)(values)
-        for place, step in enumerate(jnp.eye(2) * 1e-7):
-            change = (filtered(values + step) - filtered(values)) / 1e-7
-            np.testing.assert_allclose(jacobian[:, place], change, atol=1e-5)
-            assert np.abs(change).max() > 0.4
 
 
 @pytest.mark.slow
