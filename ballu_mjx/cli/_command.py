@@ -160,7 +160,7 @@ def load_chosen_robot(
     return found
 
 
-def start_from(task: str, data: Any, ppo: PPOConfig) -> ResumePoint:
+def find_start(task: str, data: Any, ppo: PPOConfig) -> ResumePoint:
     """Return the point at which training starts, given a command's data section; print a notice about it, if any.
 
     **Raises** `InputError` from `find_resume_point`.

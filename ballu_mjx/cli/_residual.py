@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 
@@ -21,11 +21,27 @@ from ballu_mjx.residuals.run_config import ResidualReference, describe_run
 from ballu_mjx.residuals.scales import describe_scales
 from ballu_mjx.residuals.trained_residual import TrainedResidual, describe_residual
 from ballu_mjx.rl.resume_point import ResumePoint
+from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.runs import loggers
 from ballu_mjx.runs.folder import new_folder
 from ballu_mjx.runs.record import TrainingRecord
 from ballu_mjx.sim.simulator import AugmentedSimulator, Simulator
 from ballu_mjx.viz import artifacts
+
+
+class EarlierRun(NamedTuple):
+    """Run from whose residual a command takes values. It needs the same robot and actuators."""
+
+    folder: Path
+    residual: TrainedResidual
+
+    @staticmethod
+    def load(folder: Path, robot: RobotDescription) -> EarlierRun:
+        """Load the best residual of a run.
+
+        **Raises** `InputError` from `TrainedResidual.load`.
+        """
+        return EarlierRun(folder, TrainedResidual.load(folder, robot))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,7 +95,7 @@ def train_residual(
     show: Callable[[Path, TrainedResidual], None],
     *,
     base: ResidualReference | None = None,
-    earlier: Path | None = None,
+    earlier: EarlierRun | None = None,
     start: ResumePoint | None = None,
     first: bool = True,
 ) -> int:
@@ -130,7 +146,7 @@ def prepare(
     base: ResidualReference | None = None,
     resume: Path | None = None,
     *,
-    earlier: Path | None = None,
+    earlier: EarlierRun | None = None,
     first: bool = True,
 ) -> Prepared:
     """Read and check all inputs of residual learning, and print the use of each.
@@ -139,18 +155,17 @@ def prepare(
 
     - `base`: residual that acts beside the one to be learned. None if there is none.
     - `resume`: run folder to resume. None for a new run.
-    - `earlier`: run folder of a residual from which values are taken. None if there is none. Like the base residual, it
-      needs its own robot and actuators.
+    - `earlier`: run from whose residual values are taken. None if there is none.
     - `first`: whether this process writes and prints.
 
     **Raises** `InputError` for recordings, actuators or a base residual that cannot be used. The message names them.
     """
     where = None if base is None else base.folder
-    robot = load_chosen_robot(data.robot, resume, task, where or earlier)
+    robot = load_chosen_robot(data.robot, resume, task, where or (None if earlier is None else earlier.folder))
     residual = None if base is None else TrainedResidual.load_reference(base, robot)
     before = {} if residual is None or where is None else {where: residual}
     if earlier is not None:
-        before[earlier] = TrainedResidual.load(earlier, robot)
+        before[earlier.folder] = earlier.residual
     dataset = ResidualDataset.read(data, robot, resume)
     for run, learned in before.items():
         if dataset.undecided:

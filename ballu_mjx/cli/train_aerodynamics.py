@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ballu_mjx.cli._command import TrainCommand, load_chosen_robot
-from ballu_mjx.cli._residual import Prepared, show_report, train_residual
+from ballu_mjx.cli._residual import EarlierRun, Prepared, show_report, train_residual
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.residuals.aerodynamics import AIR_PARAMETERS, Aerodynamics
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, check_air_config
@@ -49,7 +49,7 @@ def train(data: AirData, fit: AirConfig) -> int:
             prepared.simulator,
             prepared.motions["training"],
             fit,
-            fixed_from=earlier,
+            fixed_from=None if earlier is None else earlier.residual,
             free=data.free,
             run=run,
             progress=PhaseProgress(),
@@ -58,15 +58,15 @@ def train(data: AirData, fit: AirConfig) -> int:
     def sections(prepared: Prepared) -> Mapping[str, Any]:
         return {"fit": fit, "data": data}
 
-    return train_residual("aerodynamic", data, sections, learn, show_report, earlier=data.fixed_from)
+    return train_residual("aerodynamic", data, sections, learn, show_report, earlier=earlier)
 
 
-def _earlier(data: AirData, robot: RobotDescription) -> TrainedResidual | None:
-    """Return the residual of --fixed-from. None without this option."""
+def _earlier(data: AirData, robot: RobotDescription) -> EarlierRun | None:
+    """Return the run of --fixed-from. None without this option."""
     if data.fixed_from is None:
         return None
-    found = TrainedResidual.load(data.fixed_from, robot)
-    if not isinstance(found.model, Aerodynamics):
+    found = EarlierRun.load(data.fixed_from, robot)
+    if not isinstance(found.residual.model, Aerodynamics):
         raise InputError(f"{data.fixed_from}: is no run of `train aerodynamic`; give --fixed-from one of its runs.")
     return found
 

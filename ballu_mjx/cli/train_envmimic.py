@@ -7,20 +7,28 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ballu_mjx.cli._command import TrainCommand, load_chosen_robot, start_from
-from ballu_mjx.cli._residual import Prepared, settle, train_residual
+from ballu_mjx.cli._command import TrainCommand, find_start, load_chosen_robot
+from ballu_mjx.cli._residual import EarlierRun, Prepared, settle, train_residual
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.residuals.dataset import RecordingsData
 from ballu_mjx.residuals.envmimic import EnvMimicConfig
-from ballu_mjx.residuals.envmimic_training import VALIDATE_EVERY, check_envmimic_options, check_resumes, train_envmimic
+from ballu_mjx.residuals.envmimic_training import (
+    VALIDATE_EVERY,
+    check_envmimic_options,
+    check_resumes,
+    started_from,
+    train_envmimic,
+)
+from ballu_mjx.residuals.network_config import ForceNetworkConfig
 from ballu_mjx.residuals.network_loads import check_load_options
 from ballu_mjx.residuals.network_mirror import network_mirror
 from ballu_mjx.residuals.presets import PresetName, describe_preset, preset_values
+from ballu_mjx.residuals.registry import NETWORKS
 from ballu_mjx.residuals.run_config import ResidualReference, run_residual
 from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.rl import distributed, learner
-from ballu_mjx.rl.ppo import PPOConfig
-from ballu_mjx.runs.folder import read_config
+from ballu_mjx.rl.ppo import POLICY_OPTIONS, PPOConfig
+from ballu_mjx.runs.folder import read_config, typed_config
 from ballu_mjx.runs.progress import Progress
 from ballu_mjx.runs.record import TrainingRecord
 from ballu_mjx.viz import artifacts
@@ -39,6 +47,10 @@ class Data(RecordingsData, distributed.DistributedOptions):
     resume: Path | None = None
     """Resume the run in this folder from its last checkpoint, with its recordings and configuration. Options on the
     command line override its configuration. --num-timesteps counts from the start of the run."""
+    start_from: Path | None = None
+    """Run folder of a network with which the training starts: a run of `supervised`, `analytic` or `envmimic`. Options
+    of the network are those of that run, and so are the actuators, unless --actuators names others. Without this
+    option: an untrained network at the mean of the loads that the model lacks."""
     preset: PresetName | None = None
     """Named set of defaults. Options on the command line override them. paper: state, action, reward, network and
     optimizer of the paper, and the defaults of Stable-Baselines3 (docs/envmimic.md). Without this option: none."""
@@ -51,12 +63,19 @@ def train(data: Data, env: EnvMimicConfig, ppo: PPOConfig) -> int:
     distributed.join(data)
     if data.preset is not None and data.resume is not None:
         raise InputError("--preset does not go with --resume, which keeps the run's options; leave out one of them.")
-    robot = load_chosen_robot(data.robot, data.resume, "envmimic", data.residual)
+    if data.start_from is not None and data.resume is not None:
+        raise InputError("--start-from does not go with --resume, which continues the network; leave one out.")
+    if data.preset is not None and data.start_from is not None:
+        raise InputError("--preset does not go with --start-from, which keeps the network's options; leave out one.")
+    robot = load_chosen_robot(data.robot, data.resume, "envmimic", data.residual or data.start_from)
     check_envmimic_options(env, ppo, data.validate_every, robot.control_timestep)
-    start = start_from("envmimic", data, ppo)
+    start = find_start("envmimic", data, ppo)
     check_resumes(start, env, robot)
     check_load_options(env, robot)
     network_mirror(env, robot)
+    begun = data.start_from if data.resume is None else _stored_start(data.resume)
+    # A checkpoint already continues from that network.
+    earlier = None if begun is None or start.checkpoint is not None else EarlierRun.load(begun, robot)
     first = distributed.is_first()
     if first and data.preset is not None:
         print(f"--preset {data.preset} sets:\n{describe_preset(data.preset, env, ppo)}\n")
@@ -72,6 +91,7 @@ def train(data: Data, env: EnvMimicConfig, ppo: PPOConfig) -> int:
             run=run,
             progress=Progress(learner.total_timesteps(ppo, start.step), start.step) if first else None,
             start=start,
+            start_from=None if earlier is None else earlier.residual,
             evaluators=prepared.evaluators,
         )
 
@@ -87,11 +107,16 @@ def train(data: Data, env: EnvMimicConfig, ppo: PPOConfig) -> int:
 
     def sections(prepared: Prepared) -> Mapping[str, Any]:
         nonlocal env
+        if earlier is not None:
+            env, _ = started_from(earlier.residual, prepared.improved, env, ppo)
         env = settle(env, prepared, first=first)
-        return {"env": env, "ppo": ppo, "data": data}
+        if first and earlier is not None:
+            print(f"Training starts with the network of {earlier.folder}.", flush=True)
+        kept = None if begun is None else begun.resolve()
+        return {"env": env, "ppo": ppo, "data": dataclasses.replace(data, start_from=kept)}
 
     base = _base_residual(data)
-    return train_residual("envmimic", data, sections, learn, show, base=base, start=start, first=first)
+    return train_residual("envmimic", data, sections, learn, show, base=base, earlier=earlier, start=start, first=first)
 
 
 def _base_residual(data: Data) -> ResidualReference | None:
@@ -103,12 +128,26 @@ def _base_residual(data: Data) -> ResidualReference | None:
     return run_residual(read_config(data.resume, "envmimic"), data.resume)
 
 
+def _stored_start(folder: Path) -> Path | None:
+    """Return the run whose network the training in `folder` started with. None if there is none."""
+    stored = read_config(folder, "envmimic").get("data", {}).get("start_from")
+    return None if stored is None else Path(stored)
+
+
 def _defaults(data: Data) -> Mapping[str, Mapping[str, Any]]:
-    """Return the defaults that --preset and --quick imply.
+    """Return the defaults that --preset, --start-from and --quick imply.
 
     Sizes of a preset override those of --quick, because the preset's sizes match each other.
     """
     quick = QUICK if data.quick else {}
+    if data.preset is None and data.start_from is not None:
+        config = read_config(data.start_from, *NETWORKS)
+        env, network = (
+            typed_config(kind, config, section, data.start_from)
+            for kind, section in ((EnvMimicConfig, "env"), (PPOConfig, "ppo"))
+        )
+        own = {field.name: getattr(env, field.name) for field in dataclasses.fields(ForceNetworkConfig)}
+        return {"env": own, "ppo": {**quick, **{name: getattr(network, name) for name in POLICY_OPTIONS}}}
     if data.preset is None:
         return {"ppo": quick} if quick else {}
     preset = preset_values(data.preset)

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from ballu_mjx.cli._command import TrainCommand, load_chosen_robot, open_run, start_from, written_to
+from ballu_mjx.cli._command import TrainCommand, find_start, load_chosen_robot, open_run, written_to
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.identification.actuators import AUTO, NOMINAL, read_actuators, read_validation
 from ballu_mjx.policies.closed_loop import Rollout
@@ -75,7 +75,7 @@ def train(task: Task, data: Data, env: LocomotionConfig, ppo: PPOConfig) -> int:
     """Check all inputs, train a policy, write and print its rollouts, and return the exit status."""
     distributed.join(data)
     loggers.check(data.wandb)
-    start = start_from(task.name, data, ppo)
+    start = find_start(task.name, data, ppo)
     robot = load_chosen_robot(data.robot, data.resume, task.name, data.residual)
     check_task(task, robot)
     check_policy_options(env, ppo, data.keep_every, robot)

@@ -4,27 +4,30 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import Any
 
 import jax
+import numpy as np
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.evaluation.open_loop import Evaluators
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv, check_envmimic_config, resolve_envmimic
 from ballu_mjx.residuals.network import NetworkResidual
+from ballu_mjx.residuals.network_config import ForceNetworkConfig
 from ballu_mjx.residuals.network_input import num_inputs
 from ballu_mjx.residuals.network_loads import num_loads
 from ballu_mjx.residuals.trained_residual import TrainedResidual
-from ballu_mjx.residuals.training_range import with_fading
+from ballu_mjx.residuals.training_range import FadingResidual, with_fading
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.mirror import OFFSET
-from ballu_mjx.rl.ppo import PPOConfig
+from ballu_mjx.rl.ppo import Params, PPOConfig
 from ballu_mjx.rl.resume_point import ResumePoint
 from ballu_mjx.rl.training_loop import TrainingLoop, Validation
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.runs.progress import Progress
 from ballu_mjx.runs.record import MemoryRecord, TrainingRecord
-from ballu_mjx.sim.residual import add_to_base
+from ballu_mjx.sim.residual import SumOfResiduals, add_to_base
 from ballu_mjx.sim.simulator import AugmentedSimulator, Simulator
 
 VALIDATE_EVERY = 400_000
@@ -42,6 +45,7 @@ def train_envmimic(
     run: TrainingRecord | None = None,
     progress: Progress | None = None,
     start: ResumePoint | None = None,
+    start_from: TrainedResidual | None = None,
     evaluators: Evaluators | None = None,
 ) -> TrainedResidual:
     """Learn residual forces by reinforcement learning, and return those with the smallest validation error.
@@ -58,16 +62,22 @@ def train_envmimic(
     - `run`: record of metrics and checkpoints, for example a run's folder. None to keep them in memory.
     - `progress`: display that is updated after every training step.
     - `start`: point at which to resume. None to start anew.
+    - `start_from`: residual with whose network a new training starts, for example of `fit_supervised` with the same
+      forces. Options of the network's input and output that are left open are those of this network. None to start at
+      the mean of the missing loads.
     - `evaluators`: evaluators of this simulator without residual, to share their compiled programs.
 
-    **Raises** `InputError` for options that do not fit, and if learning breaks down. Raises `TrainingInterrupted` after
-    SIGINT or SIGTERM, when the last state is saved.
+    **Raises** `InputError` for options that do not fit, also from `started_from`, and if learning breaks down. Raises
+    `TrainingInterrupted` after SIGINT or SIGTERM, when the last state is saved.
     """
     config, ppo_config, start = config or EnvMimicConfig(), ppo_config or PPOConfig(), start or ResumePoint()
     augmented = simulator.with_residual(None)
     plain, robot = augmented.without_residual(), augmented.robot
     check_envmimic_options(config, ppo_config, validate_every, robot.control_timestep)
     check_resumes(start, config, robot)
+    if start_from is not None:
+        config, policy = started_from(start_from, augmented, config, ppo_config)
+        start = dataclasses.replace(start, policy=policy)
     config = resolve_envmimic(config, augmented, motions)
     sections = {"env": dataclasses.asdict(config), "ppo": dataclasses.asdict(ppo_config)}
     record = MemoryRecord(sections) if run is None else run
@@ -84,6 +94,48 @@ def train_envmimic(
     step, tree = record.best()
     params = with_base(with_range(ppo.from_tree(tree)))
     return TrainedResidual(model, params, env.observed, step, plain.actuators)
+
+
+def started_from(
+    residual: TrainedResidual, simulator: AugmentedSimulator, config: EnvMimicConfig, ppo_config: PPOConfig
+) -> tuple[EnvMimicConfig, Params]:
+    """Return the options of a training that starts with the network of `residual`, and the network's parameters.
+
+    Open options of the network's input and output are those of this network.
+
+    **Raises** `InputError` if `residual` is no network, if other options contradict it, or if it was learned in
+    addition to another base residual than that of `simulator`.
+    """
+    model, params, base = residual.model, residual.params, None
+    if isinstance(model, SumOfResiduals):
+        model, (base, params) = model.parts[1], params
+    if isinstance(model, FadingResidual):
+        model, params = model.inner, params[0]
+    if not isinstance(model, NetworkResidual) or model.network is None:
+        raise InputError(f"A training cannot start with {model.name}; give a residual whose loads a network computes.")
+    here = () if simulator.residual is None else simulator.residual.params
+    if not _same(here, () if base is None else base):
+        raise InputError(
+            "--start-from names a network that was learned with another --residual, or with none; give both the same."
+        )
+    for own, other, names in (
+        (config, model.config, [field.name for field in dataclasses.fields(ForceNetworkConfig)]),
+        (ppo_config, model.network, ppo.POLICY_OPTIONS),
+    ):
+        for name in names:
+            value, known = getattr(own, name), getattr(other, name)
+            if value not in (None, (), known):
+                option = f"--{name.replace('_', '-')}"
+                raise InputError(f"{option} is {value}, but the network of --start-from has {known}; give the same.")
+    known = {field.name: getattr(model.config, field.name) for field in dataclasses.fields(ForceNetworkConfig)}
+    return dataclasses.replace(config, **known), params
+
+
+def _same(one: Any, other: Any) -> bool:
+    """Return whether two trees have the same arrays."""
+    if jax.tree.structure(one) != jax.tree.structure(other):
+        return False
+    return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True))
 
 
 def check_envmimic_options(

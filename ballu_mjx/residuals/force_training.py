@@ -204,7 +204,7 @@ class _Fit:
 
 class _Supervised(_Fit):
     def learn(self) -> None:
-        """Label the motions, fit the network, and choose the share of its forces that acts."""
+        """Label the motions, fit networks, and choose one of them and the share of its forces that acts."""
         setup, config = self.setup, self.config
         assert isinstance(config, SupervisedConfig)
         robot, env = setup.simulator.robot, setup.forces.config
@@ -225,29 +225,49 @@ class _Supervised(_Fit):
             self.notes.append(f"Labels, {use}: {_sizes(np.concatenate(loads), env.forces, robot)}.")
         infer = jax.jit(lambda policy, seen: setup.forces.infer(setup.with_policy(policy), seen))
         seen, actions = found.get("validation", found["training"])
-        best = math.inf, 0, self.zero_policy
+        total = config.updates * len(config.observation_noise)
+        candidates: list[_Candidate] = []
+        for number, noise in enumerate(config.observation_noise):
+            best = math.inf, 0, self.zero_policy
 
-        def validate(step: int, policy: Any, loss: float) -> None:
-            nonlocal best
-            error = _rms(np.asarray(infer(policy, seen)) - actions) / _rms(actions)
-            best = min(best, (error, step, jax.device_get(policy)), key=lambda found: found[0])
-            self.log(step, {"loss": loss, "force_error": error})
-            self.show("learning", step, config.updates, error)
+            def validate(step: int, policy: Any, loss: float, before: int = number * config.updates) -> None:
+                nonlocal best
+                error = _rms(np.asarray(infer(policy, seen)) - actions) / _rms(actions)
+                best = min(best, (error, before + step, jax.device_get(policy)), key=lambda found: found[0])
+                self.log(before + step, {"loss": loss, "force_error": error})
+                self.show("learning", before + step, total, error)
 
-        validate(0, self.zero_policy, float(np.mean(found["training"][1] ** 2)))
-        force_regression.regress(infer, setup.start.policy, found["training"], config, validate)
-        _, step, policy = best
-        parts = {share: ppo.with_share(policy, share) for share in config.force_scales}
-        errors = {share: self.validate(setup.with_policy(part)) for share, part in parts.items()}
-        summary = ", ".join(f"{share:.0%}: {error:.2f}" for share, error in errors.items())
-        self.notes.append(f"Validation error by share of the forces (ratio): {summary}.")
-        share = min(errors, key=lambda share: errors[share])
-        if share == 0.0:
+            if not number:
+                validate(0, self.zero_policy, float(np.mean(found["training"][1] ** 2)))
+            force_regression.regress(infer, setup.start.policy, found["training"], config, noise, validate)
+            errors = {}
+            for share in config.force_scales:
+                part = ppo.with_share(best[2], share)
+                errors[share] = self.validate(setup.with_policy(part))
+                candidates.append(_Candidate(errors[share], noise, share, best[1], part))
+            summary = ", ".join(f"{share:.0%}: {error:.2f}" for share, error in errors.items())
+            self.notes.append(f"Validation error by share of the forces, noise {noise:g} (ratio): {summary}.")
+        chosen = min(candidates, key=lambda each: each.error)
+        if chosen.share == 0.0:
             self.notes.append("No share of the forces improves the validation error: the residual is 0.")
+        else:
+            self.notes.append(f"Kept: {chosen.share:.0%} of the forces, learned with noise {chosen.noise:g}.")
         labelled = sum(len(motion.command) for motions in uses.values() for motion in motions)
         simulated = labelled * (1 + linearize.directions)
-        self.log(config.updates + 1, {"share": share, "validation_error": errors[share], "control_steps": simulated})
-        self.save(step, parts[share], errors[share])
+        kept = {"share": chosen.share, "observation_noise": chosen.noise, "validation_error": chosen.error}
+        self.log(total + 1, {**kept, "control_steps": simulated})
+        self.save(chosen.step, chosen.policy, chosen.error)
+
+
+class _Candidate(NamedTuple):
+    """Network of *supervised* that may be kept."""
+
+    error: float
+    """Open-loop validation error."""
+    noise: float
+    share: float
+    step: int
+    policy: Any
 
 
 class _Analytic(_Fit):

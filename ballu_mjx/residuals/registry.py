@@ -128,3 +128,5 @@ KINDS: Mapping[str, ResidualKind] = {
 """All kinds of residual, by name."""
 RESIDUAL_TASKS = tuple(KINDS)
 """Tasks whose runs have a residual."""
+NETWORKS = tuple(name for name, kind in KINDS.items() if kind.network)
+"""Tasks whose runs have a network that computes loads."""

@@ -118,8 +118,8 @@ def describe_scales(config: ForceNetworkConfig, robot: RobotDescription) -> str:
     cost = getattr(config, "force_cost", None)
     costs = "" if cost is None else f" A squared unit costs {cost * scales.newtons**2:.3g} of the reward."
     mean = np.array(getattr(config, "expected_loads", ())) / scales.units
-    start = f" It starts at {', '.join(f'{each:.2g}' for each in mean)} units." if mean.any() else ""
-    return f"One unit of the network's output is: {loads}. Limit: {scales.limit:.3g} units.{start}{costs}"
+    lacking = f" The model lacks {', '.join(f'{each:.2g}' for each in mean)} units on average." if mean.any() else ""
+    return f"One unit of the network's output is: {loads}. Limit: {scales.limit:.3g} units.{lacking}{costs}"
 
 
 class MissingLoads(NamedTuple):

@@ -13,7 +13,7 @@ import math
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.flatten_util
@@ -191,11 +191,35 @@ class Learner:
         filled = state._replace(
             networks=networks, averaged=params.policy, normalizer=normalizer, steps=to_uint64(steps)
         )
+        return self._filled(filled, state)
+
+    def init_with(self, params: Params) -> TrainingState:
+        """Return the initial state with the mean actions of the policy in `params`, and its normalizer.
+
+        Exploration and value function are those of an untrained policy. Parts of the observation that the normalizer
+        lacks, such as the input of the value function, start with mean 0 and standard deviation 1.
+        """
+        state, known = self.init(self._config.seed), params.normalizer
+        count = int(known.count)
+        fresh = {name: np.zeros(size.shape, np.float32) for name, size in self._observation.items()}
+        normalizer = dataclasses.replace(
+            state.normalizer,
+            count=to_uint64(count),
+            mean={**fresh, **known.mean},
+            std={**{name: zero + 1 for name, zero in fresh.items()}, **known.std},
+            summed_variance={**{name: zero + count for name, zero in fresh.items()}, **known.summed_variance},
+        )
+        policy = jax.device_get(ppo.with_exploration(params.policy, cast(Any, state.networks.policy)))
+        networks = state.networks.replace(policy=policy)  # pyright: ignore[reportAttributeAccessIssue]
+        return self._filled(state._replace(networks=networks, averaged=policy, normalizer=normalizer), state)
+
+    def _filled(self, state: TrainingState, like: TrainingState) -> TrainingState:
+        """Move a state with arrays from the host to the devices, with the types of the state `like`."""
 
         def placeable(x: Any, like: Array) -> Any:
             return x if isinstance(x, jax.Array) else np.array(x, like.dtype)
 
-        return self._placed(jax.tree.map(placeable, filled, state))
+        return self._placed(jax.tree.map(placeable, state, like))
 
     def _placed(self, state: TrainingState) -> TrainingState:
         """Move a state from the host to the devices, as `step` needs it."""

@@ -299,14 +299,21 @@ def with_mean(policy: Mapping[str, Any], mean: Float[Array | np.ndarray, " actio
     return {**policy, "params": {**layers, _MEAN: {**last, "bias": last["bias"] + mean}}}
 
 
+def with_exploration(policy: Mapping[str, Any], other: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return a policy network with the mean actions of `policy` and the standard deviations of `other`."""
+    return {**policy, "params": {**policy["params"], _STD: other["params"][_STD]}}
+
+
 def num_actions(policy: Mapping[str, Any]) -> int:
     """Return the number of actions of a policy network."""
     layers = policy["params"]
     return len(layers[OFFSET] if OFFSET in layers else layers[_MEAN]["bias"])
 
 
-_MEAN = "Dense_0"
-"""Brax's name of the layer whose output is the mean of the action distribution."""
+_MEAN, _STD = "Dense_0", "std_logparam"
+"""Brax's names of the layer whose output is the mean of the action distribution, and of its standard deviations."""
+POLICY_OPTIONS = ("policy_layers", "activation", "normalize_observations", "observation_clip")
+"""Options of `PPOConfig` on which the meaning of a policy's parameters depends."""
 
 
 def as_tree(params: Params) -> dict[str, Any]:

@@ -29,6 +29,8 @@ class ResumePoint:
     """Folder of the resumed run. None for a new training."""
     checkpoint: Checkpoint | None = None
     """Checkpoint to resume from. None for a new training, or if the run stopped before its first checkpoint."""
+    policy: Params | None = None
+    """Parameters with whose policy a new training starts. None for an untrained policy."""
 
     @property
     def resumed_at(self) -> int | None:
@@ -77,7 +79,7 @@ class ResumePoint:
         - `tell`: receives messages about parts of the stored state that cannot be used.
         """
         if self.checkpoint is None or self.folder is None:
-            return new.init(ppo_config.seed)
+            return new.init(ppo_config.seed) if self.policy is None else new.init_with(self.policy)
         stored, before = self.checkpoint.training, self.checkpoint.notes
         anew = "the optimizer and the environments are reset"
         if stored is None:
@@ -112,7 +114,7 @@ def find_resume_point(
     before = read_config(folder, task)
     files.check_folder(folder)
     stored = typed_config(PPOConfig, before, "ppo", folder, ppo.check_values)
-    for name in ("policy_layers", "value_layers", "activation", "normalize_observations", "observation_clip"):
+    for name in (*ppo.POLICY_OPTIONS, "value_layers"):
         if getattr(stored, name) != getattr(config, name):
             raise InputError(
                 f"--{name.replace('_', '-')} does not go with --resume: the stored parameters have "

@@ -30,12 +30,18 @@ def learn_network(
     seed: int,
     *,
     quick: bool,
+    start_from: TrainedResidual | None = None,
 ) -> TrainedResidual:
-    """Learn a residual by `supervised`, `analytic` or `envmimic`, with its defaults. `quick` learns for seconds."""
+    """Learn a residual by `supervised`, `analytic` or `envmimic`, with its defaults. `quick` learns for seconds.
+
+    EnvMimic starts with the network of `start_from`, if it is given.
+    """
     if method == "envmimic":
         ppo = dataclasses.replace(QUICK if quick else PPOConfig(), seed=seed)
         config, progress = EnvMimicConfig(forces=forces), Progress(ppo.num_timesteps)
-        found = train_envmimic(simulator, training, config, ppo, validation=validation, progress=progress)
+        found = train_envmimic(
+            simulator, training, config, ppo, validation=validation, progress=progress, start_from=start_from
+        )
         progress.close()
         return found
     progress = PhaseProgress()

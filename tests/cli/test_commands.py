@@ -23,8 +23,10 @@ from ballu_mjx.recordings.importers.readers import READERS
 from ballu_mjx.residuals.dataset import RecordingsData
 from ballu_mjx.residuals.envmimic import EnvMimicConfig
 from ballu_mjx.residuals.presets import describe_preset, preset_configs
+from ballu_mjx.residuals.run_config import describe_run
 from ballu_mjx.rl import ppo as ppo_options
 from ballu_mjx.rl.ppo import PPOConfig
+from ballu_mjx.runs.folder import Run
 from ballu_mjx.runs.layout import RUN_FORMAT
 
 TRAININGS = (
@@ -218,6 +220,27 @@ def test_preset_changes_defaults_but_not_given_options(tmp_path: Path):
     assert "False, but given as True" in description and "0.0003, but given as 0.001" in description
     with pytest.raises(InputError, match="--preset does not go with --resume"):
         train_envmimic.train(train_envmimic.Data(preset="paper", resume=tmp_path), env, ppo)
+
+
+def test_a_network_to_start_with_sets_its_own_options(tmp_path: Path):
+    network = EnvMimicConfig(forces="force", force_scale=0.05, force_limit=1.0, force_cost=20.0, start_noise=0.0)
+    sections = {"env": network, "ppo": PPOConfig(policy_layers=(8,), num_envs=16)}
+    with Run(tmp_path / "run", describe_run("supervised", sections, {}, [])):
+        pass
+    found = []
+
+    def keep(data: train_envmimic.Data, env: EnvMimicConfig, ppo: PPOConfig) -> int:
+        found.append((data, env, ppo))
+        return 0
+
+    commands = {"envmimic": dataclasses.replace(train_envmimic.COMMAND, run=keep)}
+    run_command(commands, ["envmimic", "--start-from", str(tmp_path / "run"), "--force-scale", "1"], "")
+    data, env, ppo = found[0]
+    assert env == EnvMimicConfig(forces="force", force_scale=1.0, force_limit=1.0)
+    assert ppo == PPOConfig(policy_layers=(8,))
+    for other in ({"resume": tmp_path / "run"}, {"preset": "paper"}):
+        with pytest.raises(InputError, match="does not go with"):
+            train_envmimic.train(dataclasses.replace(data, **other), env, ppo)
 
 
 def test_paper_preset_has_the_batch_sizes_of_stable_baselines():

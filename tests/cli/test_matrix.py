@@ -52,6 +52,7 @@ COMMANDS = (
     *(f"train {task} --resume RUN --num-timesteps 0" for task in ("envmimic", "walk", "turn")),
     *(f"train {task} --residual RUN --recordings nowhere" for task in ("envmimic", "supervised", "analytic")),
     "train walk --residual RUN --num-envs 0",
+    "train envmimic --start-from RUN --recordings nowhere",
     "export check RUN",
     "export policy RUN --output RUN",
     "export simulator RUN --output RUN",

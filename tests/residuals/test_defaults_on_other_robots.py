@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -16,8 +17,10 @@ from ballu_mjx.evaluation.open_loop import evaluate
 from ballu_mjx.recordings.csv_format import list_recordings, read_recording
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reconstruct import reconstruct_for_simulator
+from ballu_mjx.residuals.envmimic import EnvMimicConfig
 from ballu_mjx.residuals.envmimic_training import train_envmimic
-from ballu_mjx.residuals.force_training import fit_analytic
+from ballu_mjx.residuals.force_regression import SupervisedConfig
+from ballu_mjx.residuals.force_training import fit_analytic, fit_supervised
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.robots.description import RobotDescription, read_description
 from ballu_mjx.sim.simulator import Simulator
@@ -66,9 +69,39 @@ def test_envmimic_learns_the_wind_on_a_tethered_balloon(tethered: ModuleType, tm
     assert evaluate(simulator.with_residual(learned), motions["validation"]).score < 0.5
 
 
-def test_gradients_learn_the_friction_of_a_double_pendulum():
-    robot = read_description(EXPERIMENTS / "real" / "double_pendulum" / "double_pendulum.robot.json")
-    simulator = Simulator(robot)
-    motions = [swing(robot, seed) for seed in range(8)]
+@pytest.fixture(scope="module")
+def pendulum() -> Simulator:
+    return Simulator(read_description(EXPERIMENTS / "real" / "double_pendulum" / "double_pendulum.robot.json"))
+
+
+@pytest.fixture(scope="module")
+def swings(pendulum: Simulator) -> list[Motion]:
+    return [swing(pendulum.robot, seed) for seed in range(8)]
+
+
+def test_envmimic_starts_with_a_regression_and_improves_it(pendulum: Simulator, swings: list[Motion]):
+    """Dry friction changes sign with the velocity. Regression with much noise on its input cannot learn it."""
+    uses: dict[str, Any] = {"motions": swings[:6], "validation": swings[6:]}
+    errors = {}
+    for noise in (SupervisedConfig().observation_noise, (1.0,)):
+        supervised = fit_supervised(pendulum, config=SupervisedConfig(observation_noise=noise), forces="joints", **uses)
+        errors[noise] = evaluate(pendulum.with_residual(supervised), swings[6:]).score
+        if len(noise) > 1:
+            learned = train_envmimic(
+                pendulum,
+                config=EnvMimicConfig(forces="joints"),
+                ppo_config=PPOConfig(num_timesteps=600_000),
+                validate_every=200_000,
+                start_from=supervised,
+                **uses,
+            )
+    regression, much_noise = errors.values()
+    assert regression < 0.5 and regression < 0.9 * much_noise
+    assert learned.step > 0
+    assert evaluate(pendulum.with_residual(learned), swings[6:]).score < 0.95 * regression
+
+
+def test_gradients_learn_the_friction_of_a_double_pendulum(pendulum: Simulator, swings: list[Motion]):
+    simulator, motions = pendulum, swings
     learned = fit_analytic(simulator, motions[:6], forces="joints", validation=motions[6:])
     assert evaluate(simulator.with_residual(learned), motions[6:]).score < 0.5

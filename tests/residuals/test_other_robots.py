@@ -24,6 +24,7 @@ from ballu_mjx.residuals import force_gradients, force_regression
 from ballu_mjx.residuals.aerodynamics import Aerodynamics, AirParameters
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, identify_air
 from ballu_mjx.residuals.envmimic import EnvMimicConfig, resolve_envmimic, start_spread
+from ballu_mjx.residuals.envmimic_training import started_from
 from ballu_mjx.residuals.force_gradients import AnalyticConfig, check_analytic_config, resolve_windows
 from ballu_mjx.residuals.force_regression import SupervisedConfig
 from ballu_mjx.residuals.force_training import fit_analytic, fit_supervised, resolve_joint_spreads
@@ -31,17 +32,20 @@ from ballu_mjx.residuals.network import NetworkResidual
 from ballu_mjx.residuals.network_input import num_inputs, recorded_inputs
 from ballu_mjx.residuals.network_loads import load_units, num_loads
 from ballu_mjx.residuals.trained_residual import TrainedResidual
+from ballu_mjx.residuals.training_range import TrainingRange
 from ballu_mjx.rl import ppo
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.robots.description import RobotDescription, read_description
 from ballu_mjx.sim.linearize import Linearizer
 from ballu_mjx.sim.observation import HISTORY, ObservationLayout
+from ballu_mjx.sim.residual import BoundResidual, add_to_base
 from ballu_mjx.sim.simulator import Simulator
 
 SIMULATOR = Simulator(ROBOT)
 CONFIG = EnvMimicConfig(forces="force", force_scale=0.05, force_limit=1.0, force_cost=20.0)
 PRIORS = SupervisedConfig(force_spread=0.3, force_change=0.1, torque_spread=0.05)
 NETWORK = PPOConfig(policy_layers=(16,), value_layers=(4,))
+AIR = TrainedResidual(Aerodynamics(ROBOT, SIMULATOR.mj_model), AirParameters.none(), TrainingRange.unbounded(), 0, None)
 
 
 @pytest.fixture(scope="module")
@@ -137,6 +141,44 @@ def test_regression_returns_a_residual_that_follows_the_recordings(motions: list
     assert "Labels, training" in learned.report
 
 
+def network_of(forces: EnvMimicConfig, base: BoundResidual | None = None) -> TrainedResidual:
+    """Return an untrained network for the balloon, in addition to a base residual."""
+    sizes = num_inputs(forces, ROBOT), num_loads(forces, ROBOT)
+    infer = ppo.make_inference({ppo.STATE: sizes[:1]}, sizes[1], NETWORK)
+    params = ppo.initial_policy(np.random.default_rng(0).normal(size=(50, sizes[0])), sizes[1], NETWORK)
+    model, with_base = add_to_base(base, NetworkResidual(forces, ROBOT, infer, network=NETWORK))
+    return TrainedResidual(model, with_base(params), TrainingRange.unbounded(), 1, None)
+
+
+def test_a_training_takes_open_options_from_the_network_that_it_starts_with():
+    network, vanilla = network_of(CONFIG), SIMULATOR.with_residual(None)
+    open_options = EnvMimicConfig(forces="force", start_noise=0.0)
+    config, params = started_from(network, vanilla, open_options, NETWORK)
+    assert (config.force_scale, config.force_limit) == (CONFIG.force_scale, CONFIG.force_limit)
+    assert (config.force_cost, config.start_noise) == (None, 0.0)  # not of the network's input and output
+    assert params is network.params
+    base = network.bound
+    improved = SIMULATOR.with_residual(base)
+    assert started_from(network_of(CONFIG, base), improved, open_options, NETWORK)[0] == config
+    for other, simulator, forces, layers, message in (
+        (network, vanilla, EnvMimicConfig(), NETWORK, "--forces is wrench, but the network of --start-from has force"),
+        (network, vanilla, dataclasses.replace(open_options, force_scale=1.0), NETWORK, "--force-scale is 1.0"),
+        (network, vanilla, open_options, PPOConfig(), "--policy-layers"),
+        (network, improved, open_options, NETWORK, "another --residual, or with none"),
+        (network_of(CONFIG, base), vanilla, open_options, NETWORK, "another --residual, or with none"),
+        (network_of(CONFIG, network_of(CONFIG).bound), SIMULATOR.with_residual(halved(base)), open_options, NETWORK,
+         "another --residual, or with none"),
+        (AIR, vanilla, open_options, NETWORK, "whose loads a network computes"),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=message):
+            started_from(other, simulator, forces, layers)
+
+
+def halved(residual: BoundResidual) -> BoundResidual:
+    """Return a residual with half of the parameters."""
+    return BoundResidual(residual.model, jax.tree.map(lambda x: 0.5 * x, residual.params))
+
+
 @pytest.mark.slow
 def test_gradients_return_a_residual_that_follows_the_recordings(motions: list[Motion]):
     config = AnalyticConfig(
@@ -191,7 +233,7 @@ def test_learning_does_not_depend_on_the_unit_of_commands(tmp_path: Path):
         forces = jax.jit(lambda policy, seen, infer=infer, start=start: infer(start._replace(policy=policy), seen))
         policies = []
         force_regression.regress(
-            forces, start.policy, (inputs, actions), SupervisedConfig(updates=20, validate_every=20),
+            forces, start.policy, (inputs, actions), SupervisedConfig(updates=20, validate_every=20), 1.0,
             lambda step, policy, error, policies=policies: policies.append(policy),
         )  # fmt: skip
         windows = cut_motion_windows(simulator, [motion], 1.0, 1.0)

@@ -311,6 +311,8 @@ def test_a_step_that_diverges_leaves_the_other_labels_finite(motions: list[Motio
         (SupervisedConfig(force_change=-1.0), "--force-change is -1"),
         (SupervisedConfig(force_scales=(0.5, 1.5)), "--force-scales is 0.5 1.5"),
         (SupervisedConfig(force_scales=()), "--force-scales"),
+        (SupervisedConfig(observation_noise=()), "--observation-noise"),
+        (SupervisedConfig(observation_noise=(0.1, -1.0)), "--observation-noise is 0.1 -1.0"),
         (AnalyticConfig(interval_seconds=float("inf")), "--interval-seconds"),
     ],
 )

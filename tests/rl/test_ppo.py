@@ -305,6 +305,27 @@ def test_actions_of_an_untrained_policy_are_small(trained):
     np.testing.assert_allclose(std, SMALL.initial_std, rtol=1e-6)
 
 
+def test_a_training_that_starts_with_a_policy_has_its_actions_and_explores_like_a_new_one(trained):
+    _, calls = trained
+    known = calls[-1][1]
+    # Policies of regressions have no value function.
+    learning = Learner(Follower(), SMALL)
+    state = learning.init_with(known._replace(value={}))
+    begun = training_state.params(state)
+    observations = jax.random.normal(jax.random.key(0), (100, 2))
+    infer = jax.vmap(ppo.make_inference(2, 1, SMALL), in_axes=(None, 0))
+    expected = infer(known, observations)
+    assert np.ptp(expected) > 0.1
+    np.testing.assert_allclose(infer(begun, observations), expected, atol=1e-5)
+    np.testing.assert_allclose(
+        np.exp(begun.policy["params"]["std_logparam"]["log_value"]), SMALL.initial_std, rtol=1e-6
+    )
+    after, metrics = learning.step(state)
+    assert int(after.steps) == learning.steps_each and np.isfinite(metrics["reward"])
+    untrained = calls[1][2]["reward"]
+    assert metrics["reward"] > 2 * untrained
+
+
 def test_every_reset_draws_a_new_state():
     env = training_env.wrap_for_training(Follower())
     step = jax.jit(env.step)

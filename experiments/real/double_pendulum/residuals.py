@@ -3,9 +3,9 @@
 #
 # The residual methods learn what the model of `double_pendulum.py` lacks, as torques along both joints
 # (`--forces joints`), from the same six recordings. The validation recordings choose checkpoints. Nothing tells the
-# methods that friction is missing. Identification of declared parameters, and the friction of the data's authors, are
-# the comparison. EnvMimic also learns what the identified model lacks. The header of `double_pendulum.py` names the
-# data.
+# methods that friction is missing. EnvMimic starts at the mean missing torque, or with the network of *supervised*.
+# Identification of declared parameters, and the friction of the data's authors, are the comparison. EnvMimic also
+# learns what the identified model lacks. The header of `double_pendulum.py` names the data.
 #
 # Run `python experiments/real/double_pendulum/residuals.py --data FOLDER`. `--quick` is a short trial run.
 
@@ -56,6 +56,8 @@ METHODS = {
     "identified": ("envmimic",),
 }
 """Methods that learn what the model lacks, by values of its parameters."""
+STARTED = f"{label_of('envmimic')} from supervised"
+"""Name of EnvMimic that starts with the network of *supervised* (`train envmimic --start-from`)."""
 
 
 Motions = Mapping[str, Sequence[Motion]]
@@ -172,6 +174,13 @@ def main() -> None:
             uses = motions["training"], motions["validation"]
             learned = [learn_network(method, simulator, *uses, "joints", seed, quick=quick) for seed in seeds]
             rows[label] = [errors_of(evaluators, each.model, each.params, motions) for each in learned]
+            if method == "supervised":
+                print(f"{STARTED}:", flush=True)
+                started = [
+                    learn_network("envmimic", simulator, *uses, "joints", seed, quick=quick, start_from=begun)
+                    for seed, begun in zip(seeds, learned, strict=True)
+                ]
+                rows[STARTED] = [errors_of(evaluators, each.model, each.params, motions) for each in started]
     _setup.write_tables(tables(rows), options.output, options.results, {"training": seeds})
 
 
