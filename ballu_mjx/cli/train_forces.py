@@ -89,7 +89,10 @@ def _train(
         losses = {name.replace("_", " "): read_column(folder, name) for name in names}
         metric, label = _CURVES[task]
         validated = read_column(folder, metric)
-        plots.fit_curve(folder / "learning_curve.png", losses, validated, label, task, residual.step)
+        noises = fit.observation_noise if isinstance(fit, SupervisedConfig) else ()
+        lasts = {f"noise {noise:g}": (place + 1) * fit.updates for place, noise in enumerate(noises)}
+        networks = lasts if len(lasts) > 1 else None
+        plots.fit_curve(folder / "learning_curve.png", losses, validated, label, task, residual.step, networks)
         if residual.report:
             print(residual.report)
         print(f"Best checkpoint: gradient step {residual.step:,}. ", end="")

@@ -88,18 +88,27 @@ def fit_curve(
     label: str,
     simulator: str,
     best_step: int,
+    networks: Mapping[str, int] | None = None,
 ) -> None:
     """Draw losses by name, and the validation error with the axis label `label`, over gradient steps.
 
-    The curves have the simulator's colour.
+    The curves have the simulator's colour. `networks` has the last gradient step of each network by name, if several
+    were fitted one after another.
     """
     figure, upper, lower = _over_validation(validation, simulator, "no force", float(best_step))
     for (name, curve), style in zip(losses.items(), ("-", "--"), strict=False):
         upper.plot(*curve, color=colour_of(simulator), linestyle=style, label=name)
+    before = 0
+    for name, last in (networks or {}).items():
+        upper.annotate(name, ((before + last) / 2, 0.93), xycoords=("data", "axes fraction"), ha="center")
+        for axis in (upper, lower) if before else ():
+            axis.axvline(before, color="black", linewidth=0.8)
+        before = last
     upper.set_ylabel("loss")
-    upper.legend()
+    if len(losses) > 1:
+        upper.legend()
     lower.set_ylabel(label)
-    lower.set_xlabel("gradient steps")
+    lower.set_xlabel("gradient steps, one network after another" if networks else "gradient steps")
     save_figure(figure, path)
 
 
