@@ -194,20 +194,22 @@ class Learner:
         return self._filled(filled, state)
 
     def init_with(self, params: Params) -> TrainingState:
-        """Return the initial state with the mean actions of the policy in `params`, and its normalizer.
+        """Return the initial state with the mean actions of the policy in `params`.
 
-        Exploration and value function are those of an untrained policy. Parts of the observation that the normalizer
-        lacks, such as the input of the value function, start with mean 0 and standard deviation 1.
+        Exploration and value function are those of an untrained policy. The policy's input is normalized as in
+        `params`. These statistics count like those of one training step, so that they follow the new observations.
         """
-        state, known = self.init(self._config.seed), params.normalizer
-        count = int(known.count)
-        fresh = {name: np.zeros(size.shape, np.float32) for name, size in self._observation.items()}
+        state, known, count = self.init(self._config.seed), params.normalizer, self.steps_each
+        mean = {name: np.zeros(size.shape, np.float32) for name, size in self._observation.items()}
+        mean[ppo.STATE] = np.asarray(known.mean[ppo.STATE])
+        std = {name: np.ones_like(each) for name, each in mean.items()}
+        std[ppo.STATE] = np.asarray(known.std[ppo.STATE])
         normalizer = dataclasses.replace(
             state.normalizer,
             count=to_uint64(count),
-            mean={**fresh, **known.mean},
-            std={**{name: zero + 1 for name, zero in fresh.items()}, **known.std},
-            summed_variance={**{name: zero + count for name, zero in fresh.items()}, **known.summed_variance},
+            mean=mean,
+            std=std,
+            summed_variance={name: each**2 * count for name, each in std.items()},
         )
         policy = jax.device_get(ppo.with_exploration(params.policy, cast(Any, state.networks.policy)))
         networks = state.networks.replace(policy=policy)  # pyright: ignore[reportAttributeAccessIssue]
