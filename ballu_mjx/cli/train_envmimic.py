@@ -19,7 +19,7 @@ from ballu_mjx.residuals.envmimic_training import (
     started_from,
     train_envmimic,
 )
-from ballu_mjx.residuals.network_config import ForceNetworkConfig
+from ballu_mjx.residuals.network_config import network_values
 from ballu_mjx.residuals.network_loads import check_load_options
 from ballu_mjx.residuals.network_mirror import network_mirror
 from ballu_mjx.residuals.presets import PresetName, describe_preset, preset_values
@@ -142,12 +142,10 @@ def _defaults(data: Data) -> Mapping[str, Mapping[str, Any]]:
     quick = QUICK if data.quick else {}
     if data.preset is None and data.start_from is not None:
         config = read_config(data.start_from, *NETWORKS)
-        env, network = (
-            typed_config(kind, config, section, data.start_from)
-            for kind, section in ((EnvMimicConfig, "env"), (PPOConfig, "ppo"))
-        )
-        own = {field.name: getattr(env, field.name) for field in dataclasses.fields(ForceNetworkConfig)}
-        return {"env": own, "ppo": {**quick, **{name: getattr(network, name) for name in POLICY_OPTIONS}}}
+        env = typed_config(EnvMimicConfig, config, "env", data.start_from)
+        network = typed_config(PPOConfig, config, "ppo", data.start_from)
+        policy = {name: getattr(network, name) for name in POLICY_OPTIONS}
+        return {"env": network_values(env), "ppo": {**quick, **policy}}
     if data.preset is None:
         return {"ppo": quick} if quick else {}
     preset = preset_values(data.preset)

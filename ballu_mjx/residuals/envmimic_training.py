@@ -14,7 +14,7 @@ from ballu_mjx.evaluation.open_loop import Evaluators
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.residuals.envmimic import EnvMimicConfig, EnvMimicEnv, check_envmimic_config, resolve_envmimic
 from ballu_mjx.residuals.network import NetworkResidual
-from ballu_mjx.residuals.network_config import ForceNetworkConfig
+from ballu_mjx.residuals.network_config import network_values
 from ballu_mjx.residuals.network_input import num_inputs
 from ballu_mjx.residuals.network_loads import num_loads
 from ballu_mjx.residuals.trained_residual import TrainedResidual
@@ -118,17 +118,15 @@ def started_from(
         raise InputError(
             "--start-from names a network that was learned with another --residual, or with none; give both the same."
         )
-    for own, other, names in (
-        (config, model.config, [field.name for field in dataclasses.fields(ForceNetworkConfig)]),
-        (ppo_config, model.network, ppo.POLICY_OPTIONS),
-    ):
-        for name in names:
-            value, known = getattr(own, name), getattr(other, name)
+    of_network = network_values(model.config)
+    of_policy = {name: getattr(model.network, name) for name in ppo.POLICY_OPTIONS}
+    for own, values in ((config, of_network), (ppo_config, of_policy)):
+        for name, known in values.items():
+            value = getattr(own, name)
             if value not in (None, (), known):
                 option = f"--{name.replace('_', '-')}"
                 raise InputError(f"{option} is {value}, but the network of --start-from has {known}; give the same.")
-    known = {field.name: getattr(model.config, field.name) for field in dataclasses.fields(ForceNetworkConfig)}
-    return dataclasses.replace(config, **known), params
+    return dataclasses.replace(config, **of_network), params
 
 
 def _same(one: Any, other: Any) -> bool:

@@ -226,6 +226,8 @@ class _Supervised(_Fit):
         infer = jax.jit(lambda policy, seen: setup.forces.infer(setup.with_policy(policy), seen))
         seen, actions = found.get("validation", found["training"])
         total = config.updates * len(config.observation_noise)
+        # Without loads, all networks have the same error.
+        without = self.validate(setup.with_policy(self.zero_policy)) if 0.0 in config.force_scales else math.nan
         candidates: list[_Candidate] = []
         for number, noise in enumerate(config.observation_noise):
             best = math.inf, 0, self.zero_policy
@@ -243,7 +245,7 @@ class _Supervised(_Fit):
             errors = {}
             for share in config.force_scales:
                 part = ppo.with_share(best[2], share)
-                errors[share] = self.validate(setup.with_policy(part))
+                errors[share] = self.validate(setup.with_policy(part)) if share else without
                 candidates.append(_Candidate(errors[share], noise, share, best[1], part))
             summary = ", ".join(f"{share:.0%}: {error:.2f}" for share, error in errors.items())
             self.notes.append(f"Validation error by share of the forces, noise {noise:g} (ratio): {summary}.")

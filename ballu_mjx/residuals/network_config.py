@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 from ballu_mjx.sim.force_sets import ForceSet
 
@@ -44,3 +45,8 @@ class ForceNetworkConfig:
     mirror: bool = False
     """Make the network's output symmetric about the robot's xz plane, apart from a constant: mirrored motions then have
     mirrored forces. The robot's description must declare `mirror`. Not with `--forces joints`."""
+
+
+def network_values(config: ForceNetworkConfig) -> dict[str, Any]:
+    """Return the options of the network's input and output in `config`, by name, without those of a subclass."""
+    return {field.name: getattr(config, field.name) for field in dataclasses.fields(ForceNetworkConfig)}
