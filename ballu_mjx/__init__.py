@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from ballu_mjx.residuals.force_gradients import AnalyticConfig
     from ballu_mjx.residuals.force_regression import SupervisedConfig
     from ballu_mjx.residuals.force_training import fit_analytic, fit_supervised
+    from ballu_mjx.residuals.network_config import ForceNetworkConfig
     from ballu_mjx.residuals.trained_residual import TrainedResidual
     from ballu_mjx.rl.ppo import PPOConfig
     from ballu_mjx.robots.adapter import IdentifiedActuators
@@ -78,6 +79,7 @@ _MODULES = {
     "export_simulator": "residuals.deploy.export",
     "fit_aerodynamics": "residuals.aerodynamics_training",
     "FluidConfig": "residuals.fluid_fit",
+    "ForceNetworkConfig": "residuals.network_config",
     "fit_fluid": "residuals.fluid_training",
     "fit_analytic": "residuals.force_training",
     "fit_supervised": "residuals.force_training",
@@ -123,6 +125,7 @@ __all__ = [
     "fit_aerodynamics",
     "fit_fluid",
     "FluidConfig",
+    "ForceNetworkConfig",
     "fit_analytic",
     "fit_supervised",
     "gym_env",

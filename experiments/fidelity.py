@@ -101,7 +101,7 @@ METHODS = {
     "paper": Method("EnvMimic, the paper's preset", ("envmimic", "--preset", "paper")),
     "force": Method("EnvMimic, a force alone", ("envmimic", "--forces", "force")),
     "multi": Method("EnvMimic, forces at balloon, base and feet", ("envmimic", "--forces", "multi")),
-    "regression": Method("supervised, all of its forces", ("supervised", "--force-scales", "1")),
+    "regression": Method("supervised, all of its forces", ("supervised", "--force-shares", "1")),
     "supervised": Method("supervised", ("supervised",)),
     "analytic": Method("analytic", ("analytic",)),
     "analytic-wrench": Method("analytic, wrench", ("analytic", "--forces", "wrench")),

@@ -7,7 +7,7 @@
 # for labels and networks.
 #
 # `python experiments/force_labels.py RUN [RUN ...]` takes two minutes. The runs are of
-# `train supervised --force-scales 1` on the bundled recordings, one for each seed. The table is in docs/fidelity.md,
+# `train supervised --force-shares 1` on the bundled recordings, one for each seed. The table is in docs/fidelity.md,
 # beside the open-loop errors with these networks.
 
 # %%

@@ -45,7 +45,7 @@ _FIRST = (
     _Group(
         "what to learn",
         "Choices of the method and of the quantities to learn.",
-        ("preset", "forces", "terms", "free", "force_scales", "motion", "objective", "also", "domain_randomization"),
+        ("preset", "forces", "terms", "free", "force_shares", "motion", "objective", "also", "domain_randomization"),
     ),
 )
 _LAST = (

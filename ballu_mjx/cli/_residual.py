@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 
@@ -16,7 +16,7 @@ from ballu_mjx.identification.actuator_choice import choose_actuators
 from ballu_mjx.identification.stable_time_step import check_stability
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.residuals.dataset import USES, RecordingsData, ResidualDataset
-from ballu_mjx.residuals.envmimic import EnvMimicConfig, resolve_envmimic
+from ballu_mjx.residuals.network_config import ForceNetworkConfig
 from ballu_mjx.residuals.run_config import ResidualReference, describe_run
 from ballu_mjx.residuals.scales import describe_scales
 from ballu_mjx.residuals.trained_residual import TrainedResidual, describe_residual
@@ -27,6 +27,10 @@ from ballu_mjx.runs.folder import new_folder
 from ballu_mjx.runs.record import TrainingRecord
 from ballu_mjx.sim.simulator import AugmentedSimulator, Simulator
 from ballu_mjx.viz import artifacts
+
+Config = TypeVar("Config", bound=ForceNetworkConfig)
+Resolve = Callable[[Config, AugmentedSimulator, Sequence[Motion]], Config]
+"""Function that returns options of a network with numbers for those that training motions determine."""
 
 
 class EarlierRun(NamedTuple):
@@ -123,12 +127,14 @@ def train_residual(
     return 0
 
 
-def settle(env: EnvMimicConfig, prepared: Prepared, *, first: bool = True) -> EnvMimicConfig:
+def settle(env: Config, prepared: Prepared, resolve: Resolve[Config], *, first: bool = True) -> Config:
     """Return the network's options with numbers where they depend on the robot or the recordings, and print scales.
 
-    **Raises** `InputError` from `envmimic.resolve_envmimic`.
+    `resolve` is `scales.resolve_scales` or `envmimic.resolve_envmimic`.
+
+    **Raises** `InputError` from `resolve`.
     """
-    settled = resolve_envmimic(env, prepared.improved, prepared.motions["training"])
+    settled = resolve(env, prepared.improved, prepared.motions["training"])
     if first:
         print(describe_scales(settled, prepared.dataset.robot), flush=True)
     return settled

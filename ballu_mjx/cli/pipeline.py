@@ -67,6 +67,7 @@ from ballu_mjx.residuals.aerodynamics_fit import AirConfig
 from ballu_mjx.residuals.envmimic import EnvMimicConfig
 from ballu_mjx.residuals.force_gradients import AnalyticConfig
 from ballu_mjx.residuals.force_regression import SupervisedConfig
+from ballu_mjx.residuals.network_config import ForceNetworkConfig
 from ballu_mjx.residuals.presets import preset_configs
 from ballu_mjx.rl.ppo import PPOConfig
 from ballu_mjx.rl.resume_point import is_finished
@@ -356,9 +357,9 @@ class PipelineStages:
             if isinstance(options, AirConfig):
                 train_aerodynamics.train(train_aerodynamics.AirData(**sources), options)
             elif isinstance(options, SupervisedConfig):
-                train_forces.train_supervised(train_forces.ForcesData(**sources), options)
+                train_forces.train_supervised(train_forces.ForcesData(**sources), ForceNetworkConfig(), options)
             elif isinstance(options, AnalyticConfig):
-                train_forces.train_analytic(train_forces.ForcesData(**sources), options)
+                train_forces.train_analytic(train_forces.ForcesData(**sources), ForceNetworkConfig(), options)
             else:
                 data = train_envmimic.Data(**sources, preset="paper" if method == PAPER_PRESET else None)
                 if started := list_checkpoints(folder):
@@ -373,7 +374,7 @@ class PipelineStages:
     def _supervised(self) -> SupervisedConfig:
         # Full forces, as in the paper's baseline. Other scales would reduce them where they do not help.
         return SupervisedConfig(
-            force_scales=(1.0,), seed=self.seed, **train_forces.QUICK["supervised"] if self.options.quick else {}
+            force_shares=(1.0,), seed=self.seed, **train_forces.QUICK["supervised"] if self.options.quick else {}
         )
 
     def _analytic(self) -> AnalyticConfig:

@@ -11,7 +11,7 @@ from ballu_mjx.cli._command import TrainCommand, find_start, load_chosen_robot
 from ballu_mjx.cli._residual import EarlierRun, Prepared, settle, train_residual
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.residuals.dataset import RecordingsData
-from ballu_mjx.residuals.envmimic import EnvMimicConfig
+from ballu_mjx.residuals.envmimic import EnvMimicConfig, resolve_envmimic
 from ballu_mjx.residuals.envmimic_training import (
     VALIDATE_EVERY,
     check_envmimic_options,
@@ -109,7 +109,7 @@ def train(data: Data, env: EnvMimicConfig, ppo: PPOConfig) -> int:
         nonlocal env
         if earlier is not None:
             env, _ = started_from(earlier.residual, prepared.improved, env, ppo)
-        env = settle(env, prepared, first=first)
+        env = settle(env, prepared, resolve_envmimic, first=first)
         if first and earlier is not None:
             print(f"Training starts with the network of {earlier.folder}.", flush=True)
         kept = None if begun is None else begun.resolve()

@@ -12,14 +12,17 @@ from ballu_mjx.cli._residual import Prepared, settle, train_residual
 from ballu_mjx.residuals.dataset import RecordingsData
 from ballu_mjx.residuals.force_gradients import AnalyticConfig, check_analytic_config, resolve_windows
 from ballu_mjx.residuals.force_regression import SupervisedConfig, check_supervised_config
-from ballu_mjx.residuals.force_training import fit_analytic, fit_supervised, network_sections
+from ballu_mjx.residuals.force_training import fit_analytic, fit_supervised, network_layers
+from ballu_mjx.residuals.network_config import ForceNetworkConfig, check_network_config
+from ballu_mjx.residuals.network_loads import check_load_options
+from ballu_mjx.residuals.network_mirror import network_mirror
 from ballu_mjx.residuals.run_config import ResidualReference
+from ballu_mjx.residuals.scales import resolve_scales
 from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.runs.metrics import read_column
 from ballu_mjx.runs.progress import PhaseProgress
 from ballu_mjx.runs.record import TrainingRecord
-from ballu_mjx.sim.force_sets import ForceSet, check_force_set
 from ballu_mjx.viz import plots
 
 QUICK: Mapping[str, Mapping[str, Any]] = {
@@ -38,27 +41,23 @@ _CURVES = {
 class ForcesData(RecordingsData):
     """Recordings and folders. A path is a recording (.csv or .csv.gz) or a folder of them."""
 
-    forces: ForceSet = "force"
-    """Output of the network. force: a force on the tracked body (as in the paper). wrench: a force and a torque on it.
-    multi: forces on it and at every measured point. joints: forces and torques along joints. commands: changes of the
-    commands."""
     residual: Path | None = None
     """Run folder of another residual, which acts in addition to the forces to be learned. Both must have the same
     actuators. Without this option: none."""
 
 
-def train_supervised(data: ForcesData, fit: SupervisedConfig) -> int:
+def train_supervised(data: ForcesData, env: ForceNetworkConfig, fit: SupervisedConfig) -> int:
     """Read and check all inputs, label forces, fit the network to them, evaluate it, and return the exit status."""
     check_supervised_config(fit)
-    return _train("supervised", data, fit, fit_supervised, _robot(data))
+    return _train("supervised", data, env, fit, fit_supervised, _robot(data))
 
 
-def train_analytic(data: ForcesData, fit: AnalyticConfig) -> int:
+def train_analytic(data: ForcesData, env: ForceNetworkConfig, fit: AnalyticConfig) -> int:
     """Read and check all inputs, learn, evaluate the result, and return the exit status."""
     robot = _robot(data)
     fit = resolve_windows(fit, robot)
     check_analytic_config(fit, robot.control_timestep)
-    return _train("analytic", data, fit, fit_analytic, robot)
+    return _train("analytic", data, env, fit, fit_analytic, robot)
 
 
 def _robot(data: ForcesData) -> RobotDescription:
@@ -68,10 +67,15 @@ def _robot(data: ForcesData) -> RobotDescription:
 def _train(
     task: str,
     data: ForcesData,
+    env: ForceNetworkConfig,
     fit: SupervisedConfig | AnalyticConfig,
     method: Callable[..., TrainedResidual],
     robot: RobotDescription,
 ) -> int:
+    check_network_config(env)
+    check_load_options(env, robot)
+    network_mirror(env, robot)
+
     def learn(prepared: Prepared, run: TrainingRecord) -> TrainedResidual:
         return method(
             prepared.improved,
@@ -97,13 +101,10 @@ def _train(
             print(residual.report)
         print(f"Best checkpoint: gradient step {residual.step:,}. ", end="")
 
-    env, network = network_sections(data.forces, fit.seed)
-    check_force_set(data.forces, robot)
-
     def sections(prepared: Prepared) -> Mapping[str, Any]:
         nonlocal env
-        env = settle(env, prepared)
-        return {"env": env, "ppo": network, "fit": fit, "data": data}
+        env = settle(env, prepared, resolve_scales)
+        return {"env": env, "ppo": network_layers(fit.seed), "fit": fit, "data": data}
 
     return train_residual(task, data, sections, learn, show, base=ResidualReference.chosen(data.residual))
 
@@ -111,14 +112,14 @@ def _train(
 SUPERVISED = TrainCommand(
     "Learn residual forces by regression on the forces that explain the recordings (the paper's baseline). Evaluate "
     "them on test recordings.",
-    {"data": ForcesData(), "fit": SupervisedConfig()},
+    {"data": ForcesData(), "env": ForceNetworkConfig(), "fit": SupervisedConfig()},
     train_supervised,
     {"fit": QUICK["supervised"]},
 )
 ANALYTIC = TrainCommand(
     "Learn residual forces by gradients of the tracking error through the simulation. Evaluate them on test "
     "recordings.",
-    {"data": ForcesData(), "fit": AnalyticConfig()},
+    {"data": ForcesData(), "env": ForceNetworkConfig(), "fit": AnalyticConfig()},
     train_analytic,
     {"fit": QUICK["analytic"]},
 )

@@ -25,7 +25,7 @@ from ballu_mjx.common.errors import InputError
 from ballu_mjx.common.rotations import quaternion_integrate
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import pad_to_bucket, stack_motions
-from ballu_mjx.residuals.network_config import ForceNetworkConfig
+from ballu_mjx.residuals.network_config import ForceNetworkConfig, check_network_config
 from ballu_mjx.residuals.network_input import network_input, recorded_inputs
 from ballu_mjx.residuals.network_loads import expected_units, force_frame, num_loads, square_newtons, world_loads
 from ballu_mjx.residuals.network_mirror import network_mirror
@@ -68,10 +68,6 @@ class EnvMimicConfig(ForceNetworkConfig):
     """Sharpness of the additional position term, 1/m^2."""
     fine_orientation_scale: float = 200.0
     """Sharpness of the additional orientation term, 1/rad^2. At 20, the term is still 0.92 at 6 deg of yaw."""
-    expected_loads: tuple[float, ...] = ()
-    """Loads at which an untrained policy starts, and from which the force cost counts (N, N m, commands' units; in the
-    frame of the network's output). One value stands for all loads. Without this option: the mean of the loads that the
-    model leaves unexplained in the training recordings. The paper's policy starts at 0."""
     force_cost: float | None = None
     """Cost of force, in reward per N^2. Without this option: 0.05 per squared unit of the network's
     output."""
@@ -118,17 +114,13 @@ def check_envmimic_config(config: EnvMimicConfig, control_timestep: float) -> No
 
     **Raises** `InputError` for an option out of range. The message names the option and the nearest allowed value.
     """
+    check_network_config(config)
+    of_network = {field.name for field in dataclasses.fields(ForceNetworkConfig)}
     for field in dataclasses.fields(config):
         option, value = f"--{field.name.replace('_', '-')}", getattr(config, field.name)
-        if value is None or isinstance(value, bool | str):
+        if value is None or isinstance(value, bool | str) or field.name in of_network:
             continue
-        if field.name in ("force_limit", "force_scale", "torque_scale", "scales", "fade_width"):
-            if not all(x > 0 and math.isfinite(x) for x in (value if isinstance(value, tuple) else (value,))):
-                raise InputError(f"{option} is {value}: it must be greater than 0; leave it out for the default.")
-        elif field.name == "expected_loads":
-            if not all(map(math.isfinite, value)):
-                raise InputError(f"{option} is {value}: give finite numbers; leave it out for the default.")
-        elif field.name == "episode_seconds":
+        if field.name == "episode_seconds":
             least = 2 * control_timestep
             if not (value >= least and math.isfinite(value)):
                 raise InputError(f"{option} is {value:g}: it must be {least:g} or more; {least:g} is the nearest.")

@@ -82,9 +82,9 @@ class SupervisedConfig:
     """Number of labels in a gradient step."""
     learning_rate: float = 1e-3
     """Learning rate of Adam."""
-    force_scales: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 1.0)
+    force_shares: tuple[float, ...] = (0.0, 0.25, 0.5, 0.75, 1.0)
     """Shares of the forces to try (0 to 1). The share with the smallest open-loop error on the validation recordings is
-    kept, because forces that are right in recorded states may be wrong in simulated states. `--force-scales 1` keeps
+    kept, because forces that are right in recorded states may be wrong in simulated states. `--force-shares 1` keeps
     the whole forces, as in the paper."""
     seed: int = 0
     """Seed of the network's initial parameters and of the batches."""
@@ -97,15 +97,15 @@ def check_supervised_config(config: SupervisedConfig) -> None:
     """
     for field in dataclasses.fields(config):
         value = getattr(config, field.name)
-        if value is None or field.name in ("observation_noise", "force_scales", "seed"):
+        if value is None or field.name in ("observation_noise", "force_shares", "seed"):
             continue
         if not value > 0:
             raise InputError(f"--{field.name.replace('_', '-')} is {value}: it must be greater than 0.")
     if not config.observation_noise or not all(noise >= 0.0 for noise in config.observation_noise):
         given = " ".join(map(str, config.observation_noise))
         raise InputError(f"--observation-noise is {given}: give one or more numbers of 0 or more.")
-    if not config.force_scales or not all(0.0 <= scale <= 1.0 for scale in config.force_scales):
-        raise InputError(f"--force-scales is {' '.join(map(str, config.force_scales))}: give one or more from 0 to 1.")
+    if not config.force_shares or not all(0.0 <= share <= 1.0 for share in config.force_shares):
+        raise InputError(f"--force-shares is {' '.join(map(str, config.force_shares))}: give one or more from 0 to 1.")
 
 
 class _Priors(NamedTuple):

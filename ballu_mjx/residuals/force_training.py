@@ -18,14 +18,14 @@ from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.motion_windows import cut_motion_windows
 from ballu_mjx.recordings.reference import stack_motions
 from ballu_mjx.residuals import force_gradients, force_regression
-from ballu_mjx.residuals.envmimic import EnvMimicConfig, resolve_envmimic
 from ballu_mjx.residuals.force_gradients import AnalyticConfig
 from ballu_mjx.residuals.force_regression import SupervisedConfig
 from ballu_mjx.residuals.network import NetworkResidual
+from ballu_mjx.residuals.network_config import ForceNetworkConfig, check_network_config
 from ballu_mjx.residuals.network_input import recorded_inputs
 from ballu_mjx.residuals.network_loads import expected_units, num_loads
 from ballu_mjx.residuals.network_mirror import network_mirror
-from ballu_mjx.residuals.scales import missing_loads
+from ballu_mjx.residuals.scales import missing_loads, resolve_scales
 from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.residuals.training_range import TrainingRange, with_fading
 from ballu_mjx.rl import ppo
@@ -45,7 +45,7 @@ def fit_supervised(
     motions: Sequence[Motion],
     config: SupervisedConfig | None = None,
     *,
-    forces: ForceSet | EnvMimicConfig = "force",
+    forces: ForceSet | ForceNetworkConfig = "force",
     validation: Sequence[Motion] | None = None,
     run: TrainingRecord | None = None,
     progress: PhaseProgress | None = None,
@@ -59,7 +59,7 @@ def fit_supervised(
       it. The result is the sum of both residuals.
     - `motions`: training motions.
     - `config`: options of labels and regression. None for the defaults.
-    - `forces`: force set of the network, or options with the force set and its scales. Scales that are not given are
+    - `forces`: force set of the network, or all options of its input and output. Scales that are not given are
       estimated from the motions (`scales.resolve_scales`).
     - `validation`: motions that choose the network. None for `motions`.
     - `run`: record of metrics and checkpoints, for example a run's folder. None to keep them in memory.
@@ -79,7 +79,7 @@ def fit_analytic(
     motions: Sequence[Motion],
     config: AnalyticConfig | None = None,
     *,
-    forces: ForceSet | EnvMimicConfig = "force",
+    forces: ForceSet | ForceNetworkConfig = "force",
     validation: Sequence[Motion] | None = None,
     run: TrainingRecord | None = None,
     progress: PhaseProgress | None = None,
@@ -95,9 +95,9 @@ def fit_analytic(
     return _fit(_Analytic, "analytic", simulator, uses, config, forces, run, progress, evaluators)
 
 
-def network_sections(forces: ForceSet | EnvMimicConfig, seed: int) -> tuple[EnvMimicConfig, PPOConfig]:
-    """Return the options of the network's input and output, and of its layers. They are those of EnvMimic's network."""
-    return EnvMimicConfig(forces=forces) if isinstance(forces, str) else forces, PPOConfig(seed=seed)
+def network_layers(seed: int) -> PPOConfig:
+    """Return the options of the network's layers. They are those of EnvMimic's network."""
+    return PPOConfig(seed=seed)
 
 
 def free_torques(forces: ForceSet, robot: RobotDescription) -> tuple[str, ...]:
@@ -227,7 +227,7 @@ class _Supervised(_Fit):
         seen, actions = found.get("validation", found["training"])
         total = config.updates * len(config.observation_noise)
         # Without loads, all networks have the same error.
-        without = self.validate(setup.with_policy(self.zero_policy)) if 0.0 in config.force_scales else math.nan
+        without = self.validate(setup.with_policy(self.zero_policy)) if 0.0 in config.force_shares else math.nan
         candidates: list[_Candidate] = []
         for number, noise in enumerate(config.observation_noise):
             best = math.inf, 0, self.zero_policy
@@ -243,7 +243,7 @@ class _Supervised(_Fit):
                 validate(0, self.zero_policy, float(np.mean(found["training"][1] ** 2)))
             force_regression.regress(infer, setup.start.policy, found["training"], config, noise, validate)
             errors = {}
-            for share in config.force_scales:
+            for share in config.force_shares:
                 part = ppo.with_share(best[2], share)
                 errors[share] = self.validate(setup.with_policy(part)) if share else without
                 candidates.append(_Candidate(errors[share], noise, share, best[1], part))
@@ -322,7 +322,7 @@ def _fit(
     simulator: Simulator | AugmentedSimulator,
     motions: _Uses,
     config: SupervisedConfig | AnalyticConfig,
-    forces: ForceSet | EnvMimicConfig,
+    forces: ForceSet | ForceNetworkConfig,
     run: TrainingRecord | None,
     progress: PhaseProgress | None,
     evaluators: Evaluators | None,
@@ -331,8 +331,9 @@ def _fit(
     augmented = simulator.with_residual(None)
     plain, robot = augmented.without_residual(), augmented.robot
     record = MemoryRecord({"fit": dataclasses.asdict(config)}) if run is None else run
-    env, network = network_sections(forces, config.seed)
-    env = resolve_envmimic(env, augmented, motions.training)
+    env, network = ForceNetworkConfig(forces) if isinstance(forces, str) else forces, network_layers(config.seed)
+    check_network_config(env)
+    env = resolve_scales(env, augmented, motions.training)
     reference, _ = stack_motions(plain, motions.training)
     inputs = np.asarray(recorded_inputs(reference, env, robot))
     mirror = network_mirror(env, robot)

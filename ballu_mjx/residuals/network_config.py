@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any
 
+from ballu_mjx.common.errors import InputError
 from ballu_mjx.sim.force_sets import ForceSet
 
 
@@ -29,6 +31,10 @@ class ForceNetworkConfig:
     scales: tuple[float, ...] = ()
     """Load for one unit of each output, in order, with `--forces joints` (N m, for slides N) or `--forces commands`
     (the commands' units). Without this option: the same as for the force, from the missing loads."""
+    expected_loads: tuple[float, ...] = ()
+    """Loads at which an untrained network starts, and from which EnvMimic's force cost counts (N, N m, commands' units;
+    in the frame of the network's output). One value stands for all loads. Without this option: the mean of the loads
+    that the model leaves unexplained in the training recordings. The paper's policy starts at 0."""
     observe_command: bool = True
     """Include the coming command and the last two commands in the network's input. The paper's state has none."""
     relative_observation: bool = True
@@ -45,6 +51,24 @@ class ForceNetworkConfig:
     mirror: bool = False
     """Make the network's output symmetric about the robot's xz plane, apart from a constant: mirrored motions then have
     mirrored forces. The robot's description must declare `mirror`. Not with `--forces joints`."""
+
+
+def check_network_config(config: ForceNetworkConfig) -> None:
+    """Check the options of the network's input and output.
+
+    **Raises** `InputError` for an option out of range. The message names the option.
+    """
+    for name in ("force_limit", "force_scale", "torque_scale", "scales", "fade_width"):
+        value = getattr(config, name)
+        if value is not None and not all(
+            x > 0 and math.isfinite(x) for x in (value if isinstance(value, tuple) else (value,))
+        ):
+            option = f"--{name.replace('_', '-')}"
+            raise InputError(f"{option} is {value}: it must be greater than 0; leave it out for the default.")
+    if not all(map(math.isfinite, config.expected_loads)):
+        raise InputError(
+            f"--expected-loads is {config.expected_loads}: give finite numbers; leave it out for the default."
+        )
 
 
 def network_values(config: ForceNetworkConfig) -> dict[str, Any]:

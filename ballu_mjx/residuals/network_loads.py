@@ -69,7 +69,7 @@ def check_load_options(config: ForceNetworkConfig, robot: RobotDescription) -> N
         raise InputError(
             f"--scales has {count} values: give {size} with --forces {config.forces}, or leave it out for the default."
         )
-    expected = len(getattr(config, "expected_loads", ()))
+    expected = len(config.expected_loads)
     if expected not in (0, 1, size):
         raise InputError(
             f"--expected-loads has {expected} values: give {size} with --forces {config.forces}, or one for all, or "
@@ -83,9 +83,9 @@ def load_units(config: ForceNetworkConfig, robot: RobotDescription) -> Float[np.
 
 
 def expected_units(config: ForceNetworkConfig, robot: RobotDescription) -> Float[np.ndarray, " loads"]:
-    """Return the expected loads of EnvMimic's options, as outputs of the network."""
-    expected, units = getattr(config, "expected_loads", ()) or (0.0,), load_units(config, robot)
-    return np.broadcast_to(np.asarray(expected, float), units.shape) / units
+    """Return the loads at which an untrained network starts, as its outputs."""
+    units = load_units(config, robot)
+    return np.broadcast_to(np.asarray(config.expected_loads or (0.0,), float), units.shape) / units
 
 
 def square_newtons(

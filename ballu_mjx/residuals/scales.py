@@ -77,9 +77,8 @@ def resolve_scales(config: Config, simulator: Simulator | AugmentedSimulator, mo
     open_force = vectors and config.force_scale is None
     open_torque = forces == "wrench" and config.torque_scale is None
     open_scales = not vectors and not config.scales
-    open_mean = getattr(config, "expected_loads", None) == ()
     found: dict[str, Any] = {}
-    if open_force or open_torque or open_scales or open_mean:
+    if open_force or open_torque or open_scales or not config.expected_loads:
         missing = missing_loads(augmented, motions, forces, heading_frame=config.heading_frame)
         size = missing.rms
         found["force_scale"] = round_scale(_rms(size[:3] if forces == "wrench" else size)) if vectors else 1.0
@@ -117,7 +116,7 @@ def describe_scales(config: ForceNetworkConfig, robot: RobotDescription) -> str:
     )
     cost = getattr(config, "force_cost", None)
     costs = "" if cost is None else f" A squared unit costs {cost * scales.newtons**2:.3g} of the reward."
-    mean = np.array(getattr(config, "expected_loads", ())) / scales.units
+    mean = np.array(config.expected_loads) / scales.units
     lacking = f" The model lacks {', '.join(f'{each:.2g}' for each in mean)} units on average." if mean.any() else ""
     return f"One unit of the network's output is: {loads}. Limit: {scales.limit:.3g} units.{lacking}{costs}"
 

@@ -15,13 +15,16 @@ import pytest
 from ballu_mjx import __main__ as package
 from ballu_mjx import cli
 from ballu_mjx.__main__ import COMMANDS, NAMES
-from ballu_mjx.cli import completion, train, train_envmimic
+from ballu_mjx.cli import completion, train, train_envmimic, train_forces
 from ballu_mjx.cli._command import TrainCommand, run_command
 from ballu_mjx.common import runtime
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.importers.readers import READERS
 from ballu_mjx.residuals.dataset import RecordingsData
 from ballu_mjx.residuals.envmimic import EnvMimicConfig
+from ballu_mjx.residuals.force_gradients import AnalyticConfig
+from ballu_mjx.residuals.force_regression import SupervisedConfig
+from ballu_mjx.residuals.network_config import ForceNetworkConfig
 from ballu_mjx.residuals.presets import describe_preset, preset_configs
 from ballu_mjx.residuals.run_config import describe_run
 from ballu_mjx.rl import ppo as ppo_options
@@ -101,7 +104,7 @@ def test_traceback_of_an_input_error_is_shown_with_debug(line: str, capsys: pyte
 @pytest.mark.parametrize(
     ("line", "options"),
     [
-        ("train supervised", ("--force-scales", "--forces", "--robot", "--actuators")),
+        ("train supervised", ("--force-shares", "--forces", "--robot", "--actuators")),
         ("train analytic", ("--relinearizations", "--forces", "--robot")),
         ("train aerodynamic", ("--fixed-from", "--free", "--robot")),
         ("train walk", ("--keep-every", "--robot", "--residual", "--domain-randomization")),
@@ -220,6 +223,28 @@ def test_preset_changes_defaults_but_not_given_options(tmp_path: Path):
     assert "False, but given as True" in description and "0.0003, but given as 0.001" in description
     with pytest.raises(InputError, match="--preset does not go with --resume"):
         train_envmimic.train(train_envmimic.Data(preset="paper", resume=tmp_path), env, ppo)
+
+
+@pytest.mark.parametrize("command", [train_forces.SUPERVISED, train_forces.ANALYTIC], ids=["supervised", "analytic"])
+def test_regression_and_gradients_take_all_options_of_the_network(command: TrainCommand):
+    found = []
+
+    def keep(data: train_forces.ForcesData, env: ForceNetworkConfig, fit: SupervisedConfig | AnalyticConfig) -> int:
+        found.append(env)
+        return 0
+
+    line = "--forces wrench --torque-scale 0.1 --fade-width 1 --mirror --no-observe-command"
+    run_command({"learn": dataclasses.replace(command, run=keep)}, ["learn", *line.split()], "")
+    options = {"torque_scale": 0.1, "fade_width": 1.0, "mirror": True, "observe_command": False}
+    assert found == [ForceNetworkConfig("wrench", **options)]
+    for line, message in (
+        ("--fade-width 0", "--fade-width is 0.0: it must be greater than 0"),
+        ("--forces joints --mirror", "--mirror"),
+        ("--torque-scale 1", "--torque-scale is for --forces wrench"),
+        ("--expected-loads 1 2", "--expected-loads has 2 values: give 3"),
+    ):
+        with pytest.raises(InputError, match=message):
+            run_command({"learn": command}, ["learn", *line.split()], "")
 
 
 def test_a_network_to_start_with_sets_its_own_options(tmp_path: Path):

@@ -65,7 +65,7 @@ SCALES: dict[ForceSet, tuple[float, ...]] = {"joints": (0.05, 0.02), "commands":
 
 
 def network(
-    robot: RobotDescription, forces: ForceSet, seed: int = 0, activation: Any = "swish", **settings: bool
+    robot: RobotDescription, forces: ForceSet, seed: int = 0, activation: Any = "swish", **settings: Any
 ) -> BoundResidual:
     """Return a random network residual with forces of tenths of a newton."""
     config = ForceNetworkConfig(

@@ -157,7 +157,7 @@ def test_the_missing_torque_makes_the_environment_follow_the_recording(robot: Ro
 
 
 def test_given_scales_are_kept(robot: RobotDescription, simulator: Simulator):
-    given = ForceNetworkConfig(forces="wrench", force_scale=0.3, torque_scale=0.2, force_limit=0.9)
+    given = ForceNetworkConfig("wrench", 0.9, 0.3, 0.2, expected_loads=(0.0,))
     assert resolve_scales(given, simulator, []) == given
     with pytest.raises(ValueError, match="scales of the forces are open"):
         load_scales(ForceNetworkConfig(forces="joints"), robot)

@@ -95,7 +95,7 @@ def loads(simulator: Simulator, motion: Motion, config: ForceNetworkConfig) -> A
 @pytest.mark.parametrize("forces", ["force", "wrench", "multi", "commands"])
 @pytest.mark.parametrize("options", [{}, {"heading_frame": False, "observe_command": False}], ids=["heading", "world"])
 def test_a_mirrored_motion_has_the_mirrored_loads(
-    simulator: Simulator, motion: Motion, forces: ForceSet, options: dict[str, bool]
+    simulator: Simulator, motion: Motion, forces: ForceSet, options: dict[str, Any]
 ):
     scales = (0.1,) * 2 if forces == "commands" else ()
     config = ForceNetworkConfig(

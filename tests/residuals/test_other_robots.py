@@ -134,7 +134,7 @@ def position_errors(learned: TrainedResidual, motions: list[Motion]) -> tuple[fl
 
 @pytest.mark.slow
 def test_regression_returns_a_residual_that_follows_the_recordings(motions: list[Motion]):
-    config = dataclasses.replace(PRIORS, updates=600, force_scales=(1.0,))
+    config = dataclasses.replace(PRIORS, updates=600, force_shares=(1.0,))
     learned = fit_supervised(SIMULATOR, motions, config)
     vanilla, residual = position_errors(learned, motions)
     assert residual < 0.5 * vanilla
