@@ -247,7 +247,7 @@ class _Supervised(_Fit):
                 part = ppo.with_share(best[2], share)
                 errors[share] = self.validate(setup.with_policy(part)) if share else without
                 candidates.append(_Candidate(errors[share], noise, share, best[1], part))
-            summary = ", ".join(f"{share:.0%}: {error:.2f}" for share, error in errors.items())
+            summary = ", ".join(f"{share:.0%}: {error:.3g}" for share, error in errors.items())
             self.notes.append(f"Validation error by share of the forces, noise {noise:g} (ratio): {summary}.")
         chosen = min(candidates, key=lambda each: each.error)
         if chosen.share == 0.0:

@@ -20,13 +20,13 @@
 # Results on these test flights have been reported before, so that they are development data. Other flights of the data
 # set are kept for a final check; this script does not read them.
 #
-# The methods are `train fluid` and `train envmimic`, the latter with and without `--fade-width` and `--mirror`, and
-# with several seeds. The baselines are the nominal model without air, the constant wrench that explains the training
-# flights best, the published aerodynamic model, and the mean motion of the nearest recorded moments. Errors are root
-# mean squares of the errors at the end of a horizon, over starts in every second.
+# `METHODS` lists the methods. Those with networks have several seeds. The baselines are the nominal model without air,
+# the constant wrench that explains the training flights best, the published aerodynamic model, and the mean motion of
+# the nearest recorded moments. Errors are root mean squares of the errors at the end of a horizon, over starts in every
+# second.
 #
-# Run `python experiments/real/rgblimp/rgblimp.py --data FOLDER`. `--quick` is a short trial run. Finished runs of
-# EnvMimic in `--output` are used again.
+# Run `python experiments/real/rgblimp/rgblimp.py --data FOLDER`. `--quick` is a short trial run. Finished runs in
+# `--output` are used again.
 
 # %%
 from __future__ import annotations
@@ -46,7 +46,7 @@ import lzma
 import shutil
 import statistics
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -64,11 +64,8 @@ from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.residuals.body_motion import body_motion
-from ballu_mjx.residuals.fluid_fit import FluidConfig
-from ballu_mjx.residuals.fluid_training import fit_fluid
 from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.robots.description import RobotDescription, read_description
-from ballu_mjx.runs.progress import PhaseProgress
 from ballu_mjx.sim.residual import Action, Commands, History, Residual
 from ballu_mjx.sim.simulator import Simulator
 from ballu_mjx.viz import plots
@@ -84,13 +81,51 @@ TEST: Mapping[str, tuple[int, ...]] = {
 }
 FLIP = np.array([1.0, -1.0, -1.0])
 """Signs that convert between (north, east, down) and (forward, left, up) axes, in both directions."""
-ENVMIMIC: Mapping[str, Sequence[str]] = {
-    "EnvMimic": ("--fade-width", "1"),
-    "EnvMimic without fading": (),
-    "EnvMimic without fading, `--mirror`": ("--mirror",),
+GROUPS: Mapping[str, tuple[int, ...]] = {"validation": VALIDATION, **TEST}
+"""Groups of flights in the tables."""
+
+
+class Method(NamedTuple):
+    """Method that learns a residual."""
+
+    command: tuple[str, ...]
+    """Command of `train`, with its options."""
+    earlier: tuple[str, str] | None = None
+    """Option that names a run of another method, and this method. It is earlier in `METHODS`."""
+    quick: tuple[str, ...] = ()
+    """Options for a training that takes seconds."""
+
+    @property
+    def kind(self) -> str:
+        """Name of the command."""
+        return self.command[0]
+
+    @property
+    def folder(self) -> str:
+        """Name of the method's runs."""
+        return "-".join((*self.command, *(self.earlier or ()))).replace("--", "").replace(" ", "-")
+
+
+_FADING = ("--fade-width", "1")
+_REGRESSION = ("supervised", "--forces", "wrench", *_FADING)
+_SHORT_REGRESSION = ("--updates", "20")
+_SHORT_REINFORCEMENT = ("--num-timesteps", "4000", "--num-envs", "16", "--batch-size", "16", "--num-minibatches", "4")
+METHODS: Mapping[str, Method] = {
+    "fluid": Method(
+        ("fluid", "--window-seconds", *map(str, (0.5, 2.0, HORIZONS[-1])), "--windows", "100"),
+        quick=("--terms", "linear", "--window-seconds", "0.5", "--windows", "10", "--steps", "2"),
+    ),
+    "fluid, then supervised": Method(_REGRESSION, ("--residual", "fluid"), _SHORT_REGRESSION),
+    "supervised": Method(_REGRESSION, quick=_SHORT_REGRESSION),
+    "EnvMimic": Method(("envmimic", *_FADING), quick=_SHORT_REINFORCEMENT),
+    "EnvMimic from supervised": Method(("envmimic",), ("--start-from", "supervised"), _SHORT_REINFORCEMENT),
+    "EnvMimic without fading": Method(("envmimic",), quick=_SHORT_REINFORCEMENT),
+    "EnvMimic without fading, `--mirror`": Method(("envmimic", "--mirror"), quick=_SHORT_REINFORCEMENT),
 }
-"""Options of EnvMimic, by name of the method."""
-SHORT = ("no air", "published model", "fluid", "EnvMimic", "nearest moments")
+"""Methods that learn a residual, by name."""
+QUICK_METHODS = ("fluid", "EnvMimic")
+"""Methods of a trial run."""
+SHORT = ("no air", "published model", "fluid", "fluid, then supervised", "EnvMimic", "nearest moments")
 """Rows of the short table."""
 MEANS = ("published model", "fluid")
 """Methods whose mean yaw errors are listed by thrusts."""
@@ -238,21 +273,30 @@ def errors_at(
     return np.array(recordings, int), np.array(errors).reshape(-1, 2)
 
 
-def end_errors(evaluator: OpenLoopEvaluator, replay: Replay) -> Found:
-    """Return root mean square errors of position (m) and yaw (deg) at each horizon's end, and numbers of starts."""
+def end_errors(evaluator: OpenLoopEvaluator, replay: Replay, flights: range) -> Found:
+    """Return root mean square errors of position (m) and yaw (deg) at each horizon's end, and numbers of starts.
+
+    `flights` are the numbers of the flights among those of `evaluator`.
+    """
     found = {}
     for horizon in HORIZONS:
-        _, table = errors_at(evaluator, replay, horizon)
+        recordings, table = errors_at(evaluator, replay, horizon)
+        table = table[np.isin(recordings, flights)]
         kept = table[np.isfinite(table).all(axis=1)]
         rms = np.sqrt(np.mean(kept**2, axis=0)) if len(kept) else np.full(2, np.inf)
         found[horizon] = float(rms[0]), float(rms[1]), len(table), len(table) - len(kept)
     return found
 
 
-def mean_yaw_errors(evaluator: OpenLoopEvaluator, replay: Replay) -> dict[str, float]:
-    """Return the mean signed yaw error (deg) at the last horizon's end, by thrusts of the flights."""
+def mean_yaw_errors(evaluator: OpenLoopEvaluator, replay: Replay, flights: range) -> dict[str, float]:
+    """Return the mean signed yaw error (deg) at the last horizon's end, by thrusts of the flights.
+
+    `flights` are the numbers of the flights among those of `evaluator`.
+    """
     by_thrusts: dict[str, list[float]] = {}
     for recording, (_, turn) in zip(*errors_at(evaluator, replay, HORIZONS[-1]), strict=True):
+        if recording not in flights:
+            continue
         left, right = FULL_THRUST * evaluator.motions[recording].command[0, :2]
         by_thrusts.setdefault(f"{left:.4f} and {right:.4f} N", []).append(turn)
     return {thrusts: float(np.mean(turns)) for thrusts, turns in by_thrusts.items()}
@@ -304,7 +348,7 @@ def _moments(motion: Motion, steps: int, every: int) -> tuple[np.ndarray, np.nda
 
 def tables(rows: Rows) -> dict[str, Table]:
     """Return tables of position and yaw errors (means over seeds), and a short one of both."""
-    heads = [f"{group}: {', '.join(f'{horizon:g}' for horizon in HORIZONS)} s" for group in TEST]
+    heads = [f"{group}: {', '.join(f'{horizon:g}' for horizon in HORIZONS)} s" for group in GROUPS]
     last = HORIZONS[-1]
 
     def cell(found: Sequence[Found], place: int, form: str) -> str:
@@ -336,7 +380,7 @@ def tables(rows: Rows) -> dict[str, Table]:
     return {"short": short} | {
         name: Table(
             (f"{name} ({unit})", *heads),
-            tuple((method, *(cell(groups[g], place, form) for g in TEST)) for method, groups in rows.items()),
+            tuple((method, *(cell(groups[g], place, form) for g in GROUPS)) for method, groups in rows.items()),
         )
         for place, (name, unit, form) in enumerate(units)
     }
@@ -366,27 +410,37 @@ def draw(
 
 
 # %% [markdown]
-# ## EnvMimic
+# ## Learning
 
 
 # %%
 DESCRIPTION = FOLDER / "rgblimp.robot.json"
 USES = {"training": "--recordings", "validation": "--validation", "near": "--test"}
-"""Options of the command that name flights, by use."""
-QUICK = ("--num-timesteps", "4000", "--num-envs", "16", "--batch-size", "16", "--num-minibatches", "4")
-"""Options of EnvMimic for a training that takes seconds."""
+"""Options of the commands that name flights, by use."""
 
 
-def learn(files: Mapping[str, Sequence[Path]], run: Path, options: Sequence[str]) -> TrainedResidual:
-    """Train EnvMimic with these options unless the run is finished, and return its residual."""
+def learn(name: str, files: Mapping[str, Sequence[Path]], output: Path, seed: int, *, quick: bool) -> TrainedResidual:
+    """Learn the residual of a method unless its run in `output` is finished, and return it."""
+    method = METHODS[name]
+    run = _run(output, method, seed)
     if not (run / "evaluation.json").exists():
         shutil.rmtree(run, ignore_errors=True)
         paths = [text for use in USES for text in (USES[use], *map(str, files[use]))]
-        fixed = ["--robot", str(DESCRIPTION), "--output", str(run)]
-        status = train.main(["envmimic", *fixed, *paths, *options])
+        options = [*method.command[1:], *(method.quick if quick else ()), "--robot", str(DESCRIPTION)]
+        if method.kind != "fluid":
+            options += ["--seed", str(seed)]
+        if method.earlier is not None:
+            option, other = method.earlier
+            options += [option, str(_run(output, METHODS[other], seed))]
+        status = train.main([method.kind, *options, "--output", str(run), *paths])
         if status:
             sys.exit(status)
     return TrainedResidual.load(run, read_description(DESCRIPTION))
+
+
+def _run(output: Path, method: Method, seed: int) -> Path:
+    """Return the run of a method. The same fit of *fluid* is that of all seeds."""
+    return output / (method.folder if method.kind == "fluid" else f"{method.folder}-{seed}")
 
 
 # %% [markdown]
@@ -409,48 +463,41 @@ def main() -> None:
     few = slice(0, 2) if options.quick else slice(None)
     files = {
         use: [find(options.data, number, robot, options.output / "recordings") for number in numbers[few]]
-        for use, numbers in {"training": TRAINING, "validation": VALIDATION, **TEST}.items()
+        for use, numbers in {"training": TRAINING, **GROUPS}.items()
     }
     motions = {use: load(paths, robot) for use, paths in files.items()}
-    training, validation = motions["training"], motions["validation"]
-    test = {group: motions[group] for group in TEST}
+    training, groups = motions["training"], {group: motions[group] for group in GROUPS}
     simulator = Simulator(robot)
-    config = FluidConfig(window_seconds=(0.5, 2.0, HORIZONS[-1]), windows=100)
-    methods, seeds, size = ENVMIMIC, options.seeds, ()
-    if options.quick:
-        config = FluidConfig(terms="linear", window_seconds=(0.5,), windows=10, steps=2)
-        methods, seeds, size = {"EnvMimic": ENVMIMIC["EnvMimic"]}, options.seeds[:1], QUICK
-    found = fit_fluid(simulator, training, validation, config, progress=PhaseProgress())
-    print(f"\n{found.report}\n", flush=True)
+    methods, seeds = (QUICK_METHODS, options.seeds[:1]) if options.quick else (METHODS, options.seeds)
     residuals: dict[str, list[tuple[Residual, Any]]] = {
         "published model": [(PublishedAerodynamics(robot.control_timestep), jnp.zeros(0))],
-        "fluid": [(found.model, found.params)],
     }
-    for name, extra in methods.items():
-        kind = "".join(("envmimic", *extra)).replace("--", "-")
-        learned = [
-            learn(files, options.output / f"{kind}-{seed}", [*extra, *size, "--seed", str(seed)]) for seed in seeds
-        ]
+    for name in methods:
+        own = seeds[:1] if METHODS[name].kind == "fluid" else seeds
+        learned = [learn(name, files, options.output, seed, quick=options.quick) for seed in own]
         residuals[name] = [(each.model, each.params) for each in learned]
     evaluators = Evaluators(simulator)
     drawn = {name: residuals[name][0] for name in ("published model", "fluid")}
     residuals["constant wrench"] = [fit_constant_wrench(simulator, training)]
-    rows: dict[str, dict[str, list[Found]]] = {"no air": {}}
-    means: dict[str, dict[str, float]] = {name: {} for name in MEANS}
+    flown = [motion for group in groups.values() for motion in group]  # together, so that one program replays them
+    places: dict[str, range] = {}
+    for group, flights in groups.items():
+        before = sum(map(len, places.values()))
+        places[group] = range(before, before + len(flights))
+    rows: dict[str, dict[str, list[Found]]] = {}
+    means: dict[str, dict[str, float]] = {}
     for name, runs in residuals.items():
-        rows[name] = {}
-        for group, flown in test.items():
-            evaluator = evaluators.of(runs[0][0], flown)
-            replays = [evaluator.replay(params, seconds=HORIZONS[-1]) for _, params in runs]
-            rows[name][group] = [end_errors(evaluator, replay) for replay in replays]
-            if name in MEANS:
-                turns = mean_yaw_errors(evaluator, replays[0])
-                means[name] |= {f"{group}, {thrusts}": turn for thrusts, turn in turns.items()}
-            if group not in rows["no air"]:
-                still = evaluator.replay(runs[0][1], scale=0.0, seconds=HORIZONS[-1])
-                rows["no air"][group] = [end_errors(evaluator, still)]
+        evaluator = evaluators.of(runs[0][0], flown)
+        replays = {name: [evaluator.replay(params, seconds=HORIZONS[-1]) for _, params in runs]}
+        if not rows:
+            replays = {"no air": [evaluator.replay(runs[0][1], scale=0.0, seconds=HORIZONS[-1])]} | replays
+        for each, found in replays.items():
+            rows[each] = {g: [end_errors(evaluator, replay, place) for replay in found] for g, place in places.items()}
+        if name in MEANS:
+            turns = {group: mean_yaw_errors(evaluator, replays[name][0], places[group]) for group in TEST}
+            means[name] = {f"{group}, {thrusts}": turn for group in TEST for thrusts, turn in turns[group].items()}
     rows["nearest moments"] = {
-        group: [neighbour_errors(training, flown, robot.control_timestep)] for group, flown in test.items()
+        group: [neighbour_errors(training, flown, robot.control_timestep)] for group, flown in groups.items()
     }
     signed = Table(
         (f"mean yaw error after {HORIZONS[-1]:g} s (deg)", *MEANS),
@@ -459,7 +506,7 @@ def main() -> None:
     shown = tables(rows) | {"means": signed}
     _setup.write_tables(shown, options.output, options.results, {"training": seeds})
     if options.figure is not None:  # last, because a figure in the checkout counts as a change of the code
-        draw(options.figure, evaluators, drawn, test)
+        draw(options.figure, evaluators, drawn, {group: groups[group] for group in TEST})
 
 
 if __name__ == "__main__":
