@@ -21,7 +21,7 @@ def parse(description: str, output: Path, *, trains: bool = False) -> argparse.N
     An experiment that `trains` networks has `seeds`, too.
     """
     parser = argparse.ArgumentParser(description=description)
-    parser.add_argument("--data", type=Path, required=True, help="folder of the recordings")
+    parser.add_argument("--data", type=Path, required=True, help="folder of the public files, or of recordings of them")
     if trains:
         parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="training seeds (0 1 2)")
     parser.add_argument("--quick", action="store_true", help="short trial run; the numbers mean little")

@@ -37,10 +37,17 @@ def test_steps_of_a_walker_keep_its_leg_angles_and_motor(tmp_path: Path, monkeyp
     time = np.arange(200) * 0.005
     inner_leg, outer_leg, outer_stands = 0.3 * np.sin(5 * time), 0.2 * np.cos(4 * time), time < 0.5
     table = np.stack([time, np.full(200, 0.8), outer_stands, inner_leg, outer_leg - inner_leg], axis=1)
-    path = tmp_path / "walk-00.csv.gz"
-    np.savetxt(path, table, delimiter=",", header="time,command_motor,command_inner,inner,outer", comments="")
+    np.savetxt(
+        tmp_path / "walk-00.csv.gz",
+        table,
+        delimiter=",",
+        header="time,command_motor,command_inner,inner,outer",
+        comments="",
+    )
 
-    (first_stance, first), (second_stance, second) = compass_gait.cut_steps(path)
+    (first_stance, first), (second_stance, second) = compass_gait.cut_steps(
+        compass_gait.read_walk(tmp_path, 0), "walk-00"
+    )
     assert (first_stance, second_stance) == ("outer", "inner")
     for step, stance, swing in ((first, outer_leg, inner_leg), (second, inner_leg, outer_leg)):
         rows = np.isin(time, step.time)

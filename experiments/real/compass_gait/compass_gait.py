@@ -6,11 +6,12 @@
 # Manchester, design and modelling of an open platform for dynamic walking. We use the twelve walks of ten steps in
 # `System Identification/SysID_Experiment 2/SysID_data_12exp_120steps.mat`. They are joined there end to end.
 #
-# `--data` is a folder with `walk-00.csv.gz` to `walk-11.csv.gz`, sampled at 200 Hz. The script reads these columns:
+# `--data` is a clone of that repository, or a folder with tables of the walks (`walk-00.csv.gz` to `walk-11.csv.gz`).
+# Tables are sampled at 200 Hz, and have these columns:
 #
-# | column | |
+# | column | public file |
 # | --- | --- |
-# | `time` | s |
+# | `time` | `datatime` (s) |
 # | `command_motor` | `umaxonsatu / 20 + 0.5` |
 # | `command_inner` | `innoutst`: 1 while the outer leg stands, 0 while the inner leg stands |
 # | `inner` | angle of the inner leg (rad): `-stanceangle`, plus `hipangle` while the outer leg stands |
@@ -44,8 +45,10 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 
 import _fit
+import _public
 import mujoco
 import numpy as np
+import scipy.io
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.common.results import Table
@@ -58,6 +61,12 @@ from ballu_mjx.robots.description import read_description
 TRAINING = (4, 6, 8, 10, 11)
 VALIDATION = (3, 9)
 TEST = {"near": (5, 7), "far": (0, 1, 2)}
+PUBLIC = "System Identification/SysID_Experiment 2/SysID_data_12exp_120steps.mat"
+"""Public file of the walks."""
+WALKS, STEPS = 12, 10
+"""Number of walks in the public file, and of steps in a walk."""
+COLUMNS = ("time", "command_motor", "command_inner", "inner", "outer")
+"""Columns of a walk."""
 HORIZONS = (0.1, 0.2, 0.4)
 """Times after the start of a simulation at which errors are measured (s)."""
 SAMPLING = SamplingConfig(sample_timestep=0.01, angle_noise=np.deg2rad(0.1), position_window=0.06, rate_window=0.11)
@@ -84,26 +93,57 @@ def model_of(stance: str) -> mujoco.MjModel:
     return spec.compile()
 
 
-def cut_steps(path: Path) -> list[tuple[str, Recording]]:
-    """Read a walk, and return the stance leg and a recording of each step, without its first `SETTLE`.
+def read_walk(data: Path, walk: int) -> dict[str, np.ndarray]:
+    """Return the columns of a walk, from the public file or from the walk's table.
 
-    **Raises** `InputError` if the file or a column is missing.
+    **Raises** `InputError` if `data` has neither, or if one of them is damaged.
     """
-    if not path.is_file():
-        raise InputError(f"{path}: there is no such file; give the folder of the walks.")
-    table = np.genfromtxt(path, delimiter=",", names=True)
-    for column in ("time", "command_motor", "command_inner", "inner", "outer"):
-        if column not in (table.dtype.names or ()):
-            raise InputError(f"{path}: there is no column {column}; see the table at the top of the script.")
+    path, public = data / f"walk-{walk:02d}.csv.gz", data / PUBLIC
+    if path.is_file():
+        return _public.read_columns(path, COLUMNS)
+    if not public.is_file():
+        raise InputError(
+            f"{data}: has neither {path.name} nor {PUBLIC}; give a clone of the public data, or a folder of walks."
+        )
+    return convert(public, walk)
+
+
+def convert(path: Path, walk: int) -> dict[str, np.ndarray]:
+    """Return the columns of a walk in the public file, in which the walks are joined.
+
+    **Raises** `InputError` if a variable is missing or has another length, or if the walks do not have `STEPS` each.
+    """
+    try:
+        held = scipy.io.loadmat(path)
+        variables = [held[name].ravel() for name in ("datatime", "hipangle", "innoutst", "stanceangle", "umaxonsatu")]
+        table = np.stack(variables).astype(float)
+    except (KeyError, ValueError, NotImplementedError) as error:
+        raise InputError(f"{path}: a variable is missing or damaged ({error}); download the file again.") from error
+    begins = np.r_[0, np.flatnonzero(np.diff(table[2] > 0.5)) + 1, table.shape[1]]
+    if len(begins) != WALKS * STEPS + 1:
+        raise InputError(
+            f"{path}: has {len(begins) - 1} steps instead of {WALKS} walks of {STEPS}; download the file again."
+        )
+    time, hip, outer_stands, stance, voltage = table[:, begins[walk * STEPS] : begins[(walk + 1) * STEPS]]
+    hip = np.deg2rad(hip)
+    inner = np.where(outer_stands > 0.5, hip - stance, -stance)
+    return dict(zip(COLUMNS, (time - time[0], voltage / 20 + 0.5, outer_stands, inner, -hip), strict=True))
+
+
+def cut_steps(table: Mapping[str, np.ndarray], name: str) -> list[tuple[str, Recording]]:
+    """Return the stance leg and a recording of each step of a walk, without its first `SETTLE`.
+
+    `table` has the `COLUMNS` of the walk `name`.
+    """
     outer_stands = table["command_inner"] > 0.5
     steps = []
-    for number, rows in enumerate(np.split(np.arange(len(table)), np.flatnonzero(np.diff(outer_stands)) + 1)):
+    for number, rows in enumerate(np.split(np.arange(len(outer_stands)), np.flatnonzero(np.diff(outer_stands)) + 1)):
         rows = rows[table["time"][rows] - table["time"][rows[0]] > SETTLE - 1e-6]
         outer = bool(outer_stands[rows[0]])
         sign = -1.0 if outer else 1.0  # from the outer leg's angle relative to the inner leg to that of the swing leg
         inner, relative, voltage = (table[name][rows] for name in ("inner", "outer", "command_motor"))
         step = Recording(
-            name=f"{path.name.split('.')[0]}, step {number}",
+            name=f"{name}, step {number}",
             kind="suspended",
             robot="Sydney compass gait",
             time=table["time"][rows],
@@ -120,7 +160,7 @@ def load(data: Path, walks: Sequence[int]) -> list[MeasuredMotion]:
     models = {leg: model_of(leg) for leg in LEGS}
     motions = []
     for walk in walks:
-        for leg, step in cut_steps(data / f"walk-{walk:02d}.csv.gz"):
+        for leg, step in cut_steps(read_walk(data, walk), f"walk-{walk:02d}"):
             motion = measure(step, robot, models[leg], SAMPLING)
             motions.append(begin_at(motion, round(BEGIN / motion.sample_timestep)))
     return motions

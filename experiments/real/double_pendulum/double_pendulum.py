@@ -3,10 +3,16 @@
 #
 # The data are public: `dfki-ric-underactuated-lab/double_pendulum` on GitHub, commit `1e8544e`, BSD-3-Clause; Wiebe et
 # al., open-source dual-purpose acrobot and pendubot platform, IEEE RAM 2023. We use the ten recordings of design C.1 in
-# `data/experiment_records/design_C.1/sys_id/20230629`. `--data` is a folder with these as recordings in the project's
-# format (`docs/data.md`), named `sysid-20230629-HHMMSS.csv.gz`. The columns `shoulder` and `elbow` are `pos_meas1` and
-# `pos_meas2` (rad). The columns `command_shoulder` and `command_elbow` are `tau_con / 20 + 0.5`. The positions of
-# `middle` and `tip` are computed by forward kinematics.
+# `data/experiment_records/design_C.1/sys_id/20230629`, and ten swing-ups of the acrobot in
+# `leaderboard/acrobot/real_hardware_v2/src_data/ilqr_tvlqr_lqr`. `--data` is a clone of that repository, or a folder
+# with the recordings that an earlier run made of its files (`sysid-20230629-HHMMSS.csv.gz`).
+#
+# | column of recordings | public files |
+# | --- | --- |
+# | `time` | resampled at 500 Hz |
+# | `command_shoulder`, `command_elbow` | `tau_con1 / 20 + 0.5`, `tau_con2 / 20 + 0.5`, held between samples |
+# | `shoulder`, `elbow` | `pos_meas1`, `pos_meas2` (rad) |
+# | positions of `middle` and `tip`, orientation of `tip` | by forward kinematics |
 #
 # The model has the published masses, lengths and inertias. Masses, centres of mass and inertias of the links are
 # identified too, as far as they have an effect in the plane, because the published ones were identified together with
@@ -32,14 +38,17 @@ _setup.prepare()
 from collections.abc import Sequence
 
 import _fit
+import _public
 import numpy as np
 
+from ballu_mjx.common.errors import InputError
 from ballu_mjx.common.results import Cell, Table
 from ballu_mjx.identification.declarations import declared_parameters
 from ballu_mjx.identification.fit_robot import FitConfig, HeldOut, RobotFit, fit_robot, replay
 from ballu_mjx.identification.measured_motion import MeasuredMotion, SamplingConfig, measure
 from ballu_mjx.identification.window_simulator import cut_windows
 from ballu_mjx.recordings.csv_format import read_recording
+from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.robots.description import read_description
 
 TRAINING = ("143339", "143524", "143601", "143704", "144115", "154220")
@@ -56,12 +65,73 @@ PUBLISHED = {
 """Friction of the data's authors. Their model of Coulomb friction is cf atan(100 v)."""
 
 
+SOURCES = {
+    f"sysid-20230629-{time}": f"data/experiment_records/design_C.1/sys_id/20230629/20230629-{time}/trajectory.csv"
+    for time in (*TRAINING, *VALIDATION, *TEST)
+}
+"""Paths of the public files, by name of the recording."""
+SWING_UPS = {
+    f"acrobot-ilqr_tvlqr_lqr-experiment{number:02d}": (
+        f"leaderboard/acrobot/real_hardware_v2/src_data/ilqr_tvlqr_lqr/experiment{number:02d}/trajectory.csv"
+    )
+    for number in range(1, 11)
+}
+"""The same for the swing-ups."""
+TIMESTEP = 0.002
+"""Time between two samples of the recordings (s)."""
+TORQUE = 10.0
+"""Torque at a command of 1 (N m)."""
 HORIZONS = (0.4, 1.0)
 """Horizons of the errors on held-out recordings (s)."""
 SWING_UP_HORIZON = 0.4
 """Horizon of the errors on swing-ups (s)."""
 INTERVAL = 0.2
 """Time between the starts of two replays (s)."""
+
+
+def prepare(data: Path, made: Path) -> Path:
+    """Return the folder with all recordings, which are written to `made` if `data` has public files instead.
+
+    Swing-ups that `data` lacks are left out.
+
+    **Raises** `InputError` from `_public.recordings_of`.
+    """
+    swings = {
+        name: source
+        for name, source in SWING_UPS.items()
+        if (data / f"{name}.csv.gz").is_file() or _public.public_file(data, source)
+    }
+    robot = read_description(FOLDER / "double_pendulum.robot.json")
+    return _public.recordings_of(data, made, SOURCES | swings, convert, robot)
+
+
+def convert(path: Path, name: str) -> Recording:
+    """Return a run of the public data as a recording at 500 Hz.
+
+    **Raises** `InputError` if the file lacks a column, or if its times do not increase.
+    """
+    robot = read_description(FOLDER / "double_pendulum.robot.json")
+    columns = _public.read_columns(path, ("time", "pos_meas1", "pos_meas2", "tau_con1", "tau_con2"))
+    time = columns["time"] - columns["time"][0]
+    if not (np.diff(time) > 0).all():
+        row = int(np.argmin(np.diff(time) > 0)) + 3
+        raise InputError(f"{path}, column time, row {row}: times must increase; download the file again.")
+    even = np.arange(0.0, time[-1], TIMESTEP)
+    last = np.searchsorted(time, even, side="right") - 1
+    angles = {
+        joint: np.interp(even, time, columns[column])
+        for joint, column in (("shoulder", "pos_meas1"), ("elbow", "pos_meas2"))
+    }
+    recording = Recording(
+        name=name,
+        kind="free",
+        robot="DFKI double pendulum C.1",
+        notes=f"dfki-ric-underactuated-lab/double_pendulum 1e8544e {path.parent.name}/{path.name}, BSD-3-Clause",
+        time=even,
+        command=np.stack([columns[f"tau_con{k}"][last] for k in (1, 2)], axis=1) / (2 * TORQUE) + 0.5,
+        joint_angles=angles,
+    )
+    return _public.with_kinematics(recording, robot, robot.load_model())
 
 
 def load(data: Path, names: tuple[str, ...]) -> list[MeasuredMotion]:
@@ -76,7 +146,7 @@ def load_swing_ups(data: Path) -> list[MeasuredMotion]:
 
 def swing_ups(data: Path) -> list[Path]:
     """Return the recorded swing-ups of the acrobot under the controller `ilqr_tvlqr_lqr`."""
-    return sorted(data.glob("acrobot-ilqr_tvlqr_lqr-experiment*.csv.gz"))
+    return [path for name in SWING_UPS if (path := data / f"{name}.csv.gz").is_file()]
 
 
 def read(paths: list[Path]) -> list[MeasuredMotion]:
@@ -148,13 +218,14 @@ def tip(angles: np.ndarray) -> np.ndarray:
 def main() -> None:
     description = "Identify a geared double pendulum, and test on runs that the fit has not seen."
     options = _fit.parse(description, Path("runs/double_pendulum"))
-    fit = identify(options.data, quick=options.quick)
+    data = prepare(options.data, options.output / "recordings")
+    fit = identify(data, quick=options.quick)
     _fit.show(fit)
     print(f"validation, score: nominal {fit.nominal.score:.3g}, identified {fit.identified.score:.3g}")
     horizons = HORIZONS[:1] if options.quick else HORIZONS
-    motions = load(options.data, (*VALIDATION, *TEST))
+    motions = load(data, (*VALIDATION, *TEST))
     tables = {f"after_{1000 * seconds:.0f}_ms": held_out_table(fit, motions, seconds) for seconds in horizons}
-    if swing_ups := [] if options.quick else load_swing_ups(options.data):
+    if swing_ups := [] if options.quick else load_swing_ups(data):
         tables["swing_ups"] = swing_up_table(fit, swing_ups)
     tables["parameters"] = _fit.parameter_table(fit, PUBLISHED)
     _setup.write_tables(tables, options.output, options.results, {})

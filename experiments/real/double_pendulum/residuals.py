@@ -159,13 +159,14 @@ def main() -> None:
     options = _fit.parse(description, Path("runs/double_pendulum_residuals"), trains=True)
     quick, seeds = options.quick, options.seeds[:1] if options.quick else options.seeds
     robot = read_description(FOLDER / "double_pendulum.robot.json")
-    fit = double_pendulum.identify(options.data, quick=quick)
+    data = double_pendulum.prepare(options.data, options.output / "recordings")
+    fit = double_pendulum.identify(data, quick=quick)
     vectors = _fit.candidates(fit, double_pendulum.PUBLISHED)
     rows: dict[str, list[Found]] = {}
     for name, vector in vectors.items():
         actuators = None if name == "nominal" else IdentifiedParameters(jnp.asarray(vector), fit.parameters)
         simulator = Simulator(robot, actuators)
-        motions, evaluators = load(options.data, simulator, quick=quick), Evaluators(simulator)
+        motions, evaluators = load(data, simulator, quick=quick), Evaluators(simulator)
         nothing = ConstantWrench(anchored=robot.anchored), jnp.zeros(6)
         rows[name] = [errors_of(evaluators, *nothing, motions)]
         for method in METHODS[name]:

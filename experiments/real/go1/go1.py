@@ -5,9 +5,10 @@
 # commit `38071b1`, `example_data/data_raw_go1`, a fork of `Rhoban/bam` (Apache-2.0). Method and friction models are by
 # Duclusaud et al., ICRA 2025 (arXiv 2410.08650).
 #
-# `--data` is a folder with `go1_0/recordings` to `go1_3/recordings`. Each has three recordings in the project's format
-# (`docs/data.md`): `sin_sin`, `sin_time_square` and `up_and_down`. The column `motor` is `position` (rad), and
-# `command_goal` is `goal_position / (2 pi) + 0.5`. `lift_and_drop` is left out, because it switches the motor off, and
+# `--data` is a clone of that repository, or a folder with the recordings that an earlier run made of its files
+# (`go1_0/recordings` to `go1_3/recordings`). Each payload has three recordings: `sin_sin`, `sin_time_square` and
+# `up_and_down`. The column `motor` is `position` (rad), and `command_goal` is `goal_position / (2 pi) + 0.5`. The pose
+# of `load` is computed by forward kinematics. `lift_and_drop` is left out, because it switches the motor off, and
 # commands do not show this.
 #
 # The fit uses 0, 1 and 2 kg. Each payload has its own model, and all models share the parameters.
@@ -28,25 +29,82 @@ import _setup
 _setup.prepare()
 
 import _fit
+import _public
 import mujoco
 import numpy as np
 
+from ballu_mjx.common import files
+from ballu_mjx.common.errors import InputError
 from ballu_mjx.common.results import Cell, Table
 from ballu_mjx.identification.declarations import declared_parameters
 from ballu_mjx.identification.fit_robot import FitConfig, RobotFit, fit_robot, replay
 from ballu_mjx.identification.measured_motion import MeasuredMotion, SamplingConfig, measure
 from ballu_mjx.recordings.csv_format import list_recordings, read_recording
+from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.robots.description import read_description
 
 LOADS = (0, 1, 2, 3)
 """Payloads (kg). The last one is for the test."""
 SAMPLING = SamplingConfig(sample_timestep=0.016, angle_noise=np.deg2rad(0.1), position_window=0.08, rate_window=0.1)
+TRAJECTORIES = ("sin_sin", "sin_time_square", "up_and_down")
+"""Trajectories of the goal."""
+PUBLIC = "example_data/data_raw_go1"
+"""Folder of the public files."""
 LIGHTEST = 0.001
 """Mass (kg) of the payload's body without payload, because MuJoCo needs a positive mass."""
 PUBLISHED = {"motor_frictionloss": 0.0914, "motor_damping": 0.047}
 """Coulomb and viscous friction of the data's authors."""
 SECONDS = 5.9
 """Length of the replays (s)."""
+
+
+def prepare(data: Path, made: Path) -> Path:
+    """Return the folder with all recordings, which are written to `made` if `data` has public files instead.
+
+    **Raises** `InputError` from `_public.recordings_of`, or if a public file is damaged.
+    """
+    found = {}
+    for path in sorted((data / PUBLIC).glob("*.json")):
+        log = files.read_json(path, "download the file again")
+        found[log.get("mass"), log.get("trajectory")] = str(path.relative_to(data))
+    sources = {
+        f"go1_{kilograms}/recordings/{trajectory}": found.get(
+            (kilograms, trajectory), f"{PUBLIC}/*.json with {kilograms} kg and {trajectory}"
+        )
+        for kilograms in LOADS
+        for trajectory in TRAJECTORIES
+    }
+    return _public.recordings_of(data, made, sources, convert, read_description(FOLDER / "go1.robot.json"))
+
+
+def convert(path: Path, name: str) -> Recording:
+    """Return a run of the public data as a recording.
+
+    **Raises** `InputError` if the file lacks an entry, or if an entry is not a finite number.
+    """
+    robot = read_description(FOLDER / "go1.robot.json")
+    entries = files.read_json(path, "download the file again").get("entries", [])
+    try:
+        rows = np.array(
+            [[entry[key] for key in ("timestamp", "position", "goal_position")] for entry in entries], float
+        )
+        time, position, goal = rows.T
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{path}: entries must have the numbers timestamp, position and goal_position; download the file again."
+        ) from error
+    if not (np.isfinite(rows).all() and (np.diff(time) > 0).all()):
+        raise InputError(f"{path}: entries must be finite, and times must increase; download the file again.")
+    recording = Recording(
+        name=name,
+        kind="free",
+        robot="Unitree Go1 motor",
+        notes=f"rimim/bam 38071b1 {PUBLIC}/{path.name}, fork of Rhoban/bam (Apache-2.0)",
+        time=time - time[0],
+        command=goal[:, None] / (2 * np.pi) + 0.5,
+        joint_angles={"motor": position},
+    )
+    return _public.with_kinematics(recording, robot, robot.load_model())
 
 
 def load(data: Path, kilograms: int) -> list[MeasuredMotion]:
@@ -78,12 +136,13 @@ def mean_errors(fit: RobotFit, motions: list[MeasuredMotion], points: list[np.nd
 def main() -> None:
     description = "Identify a Unitree Go1 motor with 0, 1 and 2 kg, and test with 3 kg."
     options = _fit.parse(description, Path("runs/go1"))
-    fit = identify(options.data, quick=options.quick)
+    data = prepare(options.data, options.output / "recordings")
+    fit = identify(data, quick=options.quick)
     _fit.show(fit)
     points = _fit.candidates(fit, PUBLISHED)
     rows = []
     for kilograms in LOADS[-1:] if options.quick else LOADS:
-        errors = mean_errors(fit, load(options.data, kilograms), list(points.values()))
+        errors = mean_errors(fit, load(data, kilograms), list(points.values()))
         rows.append((f"{kilograms} kg", *(Cell((float(error),)) for error in errors.mean(axis=1))))
     heads = (f"mean error over {SECONDS:g} s (deg)", *points)
     tables = {"loads": Table(heads, tuple(rows)), "parameters": _fit.parameter_table(fit, PUBLISHED)}

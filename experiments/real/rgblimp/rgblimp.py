@@ -35,19 +35,19 @@ import sys
 from pathlib import Path
 
 FOLDER = Path("experiments/real/rgblimp") if "ipykernel" in sys.modules else Path(__file__).parent
-sys.path[1:1] = [str(FOLDER.parents[1])]
+sys.path[1:1] = [str(FOLDER.parent), str(FOLDER.parents[1])]
 
 import _setup
 
 _setup.prepare()
 
 import argparse
-import lzma
 import shutil
 import statistics
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+import _public
 import jax.numpy as jnp
 import numpy as np
 from _constant_wrench import fit_constant_wrench
@@ -56,10 +56,9 @@ from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
 from ballu_mjx.cli import train
-from ballu_mjx.common.errors import InputError
 from ballu_mjx.common.results import Cell, Table
 from ballu_mjx.evaluation.open_loop import Evaluators, OpenLoopEvaluator, Replay
-from ballu_mjx.recordings.csv_format import read_recording, write_recording
+from ballu_mjx.recordings.csv_format import read_recording
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.recordings.recording import Recording
@@ -144,16 +143,10 @@ def convert(path: Path, name: str) -> Recording:
 
     **Raises** `InputError` if the file lacks a column.
     """
-    text = lzma.open(path, "rt").read() if path.suffix == ".xz" else path.read_text()
-    header, *rows = text.split("\n")
-    columns = header.strip().split(",")
-    table = np.array([row.split(",") for row in rows if row.strip()], float)
     wanted = [*(f"{kind}_{k}" for kind in ("p", "e", "rb_series") for k in (1, 2, 3)), "Fl_series", "Fr_series"]
-    for column in wanted:
-        if column not in columns:
-            raise InputError(f"{path}: there is no column {column}; give a file of the public data set.")
-    place, angles, gondola = (table[:, [columns.index(c) for c in wanted[k : k + 3]]] for k in (0, 3, 6))
-    left, right = (table[:, columns.index(c)] for c in wanted[9:])
+    columns = np.array([*_public.read_columns(path, wanted).values()])
+    place, angles, gondola = columns[:9].reshape(3, 3, -1).swapaxes(1, 2)
+    left, right = columns[9:]
     turns = Rotation.from_euler("ZYX", angles[:, ::-1]).as_matrix() * FLIP[:, None] * FLIP
     mass = gondola[:, 0]
     return Recording(
@@ -161,7 +154,7 @@ def convert(path: Path, name: str) -> Recording:
         kind="free",
         robot="RGBlimp",
         notes=f"zhu-yj/ABNODE 138a1de data/{path.name}, MIT",
-        time=np.arange(len(table)) / 60,
+        time=np.arange(len(place)) / 60,
         command=np.stack([left / FULL_THRUST, right / FULL_THRUST, (mass - FIRST_PLACE) / TRAVEL], axis=1),
         tracked_position=place * FLIP,
         tracked_quaternion=Rotation.from_matrix(turns).as_quat(scalar_first=True),
@@ -169,21 +162,22 @@ def convert(path: Path, name: str) -> Recording:
     )
 
 
-def find(data: Path, number: int, robot: RobotDescription, made: Path) -> Path:
-    """Return the recording of a flight, given the number of its file. A converted recording is written to `made`.
+SOURCES = {number: f"data_{number}.csv" for numbers in (TRAINING, *GROUPS.values()) for number in numbers}
+"""Public files by number."""
 
-    **Raises** `InputError` if `data` has neither the file nor its recording.
+
+def find(data: Path, numbers: Sequence[int], robot: RobotDescription, made: Path) -> list[Path]:
+    """Return recordings of flights, given the numbers of their files. Recordings are written to `made`.
+
+    **Raises** `InputError` from `_public.recordings_of`.
     """
-    name = f"flight-{number:03d}.csv.gz"
-    for path in (data / name, made / name):
-        if path.exists():
-            return path
-    raw = next((p for e in ("csv", "csv.xz") if (p := data / f"data_{number}.{e}").exists()), None)
-    if raw is None:
-        raise InputError(f"{data}: has neither data_{number}.csv nor {name}; download the public data set.")
-    made.mkdir(parents=True, exist_ok=True)
-    write_recording(convert(raw, name.removesuffix(".csv.gz")), made / name, robot)
-    return made / name
+    sources = {_name(number): SOURCES[number] for number in numbers}
+    folder = _public.recordings_of(data, made, sources, convert, robot)
+    return [folder / f"{name}.csv.gz" for name in sources]
+
+
+def _name(number: int) -> str:
+    return f"flight-{number:03d}"
 
 
 def load(paths: Sequence[Path], robot: RobotDescription) -> list[Motion]:
@@ -462,7 +456,7 @@ def main() -> None:
     robot = read_description(DESCRIPTION)
     few = slice(0, 2) if options.quick else slice(None)
     files = {
-        use: [find(options.data, number, robot, options.output / "recordings") for number in numbers[few]]
+        use: find(options.data, numbers[few], robot, options.output / "recordings")
         for use, numbers in {"training": TRAINING, **GROUPS}.items()
     }
     motions = {use: load(paths, robot) for use, paths in files.items()}

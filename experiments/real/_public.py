@@ -1,0 +1,110 @@
+"""Shared code of the experiments on public recordings: from the public files to recordings of the project's format."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import lzma
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from ballu_mjx.common import files
+from ballu_mjx.common.errors import InputError
+from ballu_mjx.recordings.csv_format import write_recording
+from ballu_mjx.recordings.recording import Recording
+from ballu_mjx.robots.description import RobotDescription
+
+
+def recordings_of(
+    data: Path,
+    made: Path,
+    sources: Mapping[str, str],
+    convert: Callable[[Path, str], Recording],
+    robot: RobotDescription,
+) -> Path:
+    """Return the folder that holds `NAME.csv.gz` of all recordings: `data`, or else `made`.
+
+    In `made`, recordings that are not there yet are written from the public files in `data`.
+
+    **Arguments**
+
+    - `sources`: path of the public file in `data`, by name of the recording. A name may have folders. A file may be
+      compressed (`.xz`).
+    - `convert`: function of the public file and the recording's name that returns the recording.
+
+    **Raises** `InputError` if `data` lacks a public file, and from `convert`.
+    """
+    if all((data / f"{name}.csv.gz").is_file() for name in sources):
+        return data
+    for name, source in sources.items():
+        target = made / f"{name}.csv.gz"
+        if target.is_file():
+            continue
+        path = public_file(data, source)
+        if path is None:
+            raise InputError(
+                f"{data}: has neither {name}.csv.gz nor {source}; give the folder of the public data set, or of "
+                "recordings made of it."
+            )
+        target.parent.mkdir(parents=True, exist_ok=True)
+        write_recording(convert(path, Path(name).name), target, robot)
+    return made
+
+
+def public_file(data: Path, source: str) -> Path | None:
+    """Return a public file, which may be compressed (`.xz`). None if there is none."""
+    return next((path for path in (data / source, data / f"{source}.xz") if path.is_file()), None)
+
+
+def read_columns(path: Path, wanted: Sequence[str]) -> dict[str, Float[np.ndarray, " rows"]]:
+    """Return columns of a table with commas and a header. The file may be compressed (`.xz` or `.gz`).
+
+    **Raises** `InputError` if a column is missing, or if a cell of a wanted column is not a finite number.
+    """
+    try:
+        text = lzma.open(path, "rt").read() if path.suffix == ".xz" else files.read_text(path)
+    except (EOFError, lzma.LZMAError) as error:
+        raise InputError(f"{path}: not a whole .xz file; download the file again.") from error
+    header, _, body = text.partition("\n")
+    columns = [column.strip() for column in header.split(",")]
+    for column in wanted:
+        if column not in columns:
+            raise InputError(f"{path}: there is no column {column}; give a file of the public data set.")
+    if not body.strip():
+        raise InputError(f"{path}: there is no row below the header; download the file again.")
+    places = [columns.index(column) for column in wanted]
+    try:
+        table = np.genfromtxt(io.StringIO(body), delimiter=",", usecols=places, ndmin=2)
+    except ValueError as error:
+        raise InputError(f"{path}: rows have different numbers of cells; download the file again.") from error
+    bad = np.argwhere(~np.isfinite(table))
+    if len(bad):
+        row, place = bad[0]
+        raise InputError(
+            f"{path}, column {wanted[place]}, row {row + 2}: the cell is not a finite number; download the file again."
+        )
+    return dict(zip(wanted, table.T, strict=True))
+
+
+def with_kinematics(recording: Recording, robot: RobotDescription, model: mujoco.MjModel) -> Recording:
+    """Return a recording of joint angles with the poses of the description's sites, by forward kinematics."""
+    data = mujoco.MjData(model)
+    names = robot.tracked, *robot.points
+    positions, turns = {name: [] for name in names}, []
+    for number in range(len(recording.time)):
+        for joint, angles in recording.joint_angles.items():
+            data.joint(joint).qpos[:] = angles[number]
+        mujoco.mj_kinematics(model, data)
+        for name in names:
+            positions[name].append(data.site(name).xpos.copy())
+        turns.append(data.body(model.site_bodyid[model.site(robot.tracked).id]).xquat.copy())
+    return dataclasses.replace(
+        recording,
+        tracked_position=np.array(positions[robot.tracked]),
+        tracked_quaternion=np.array(turns),
+        points={name: np.array(positions[name]) for name in robot.points},
+    )
