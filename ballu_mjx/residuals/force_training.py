@@ -207,7 +207,29 @@ class _Supervised(_Fit):
         """Label the motions, fit networks, and choose one of them and the share of its forces that acts."""
         setup, config = self.setup, self.config
         assert isinstance(config, SupervisedConfig)
-        robot, env = setup.simulator.robot, setup.forces.config
+        examples, simulated = self._labels(config)
+        infer = jax.jit(lambda policy, seen: setup.forces.infer(setup.with_policy(policy), seen))
+        # Without loads, all networks have the same error.
+        without = self.validate(setup.with_policy(self.zero_policy)) if 0.0 in config.force_shares else math.nan
+        candidates = [
+            candidate
+            for number in range(len(config.observation_noise))
+            for candidate in self._networks(config, number, infer, examples, without)
+        ]
+        chosen = min(candidates, key=lambda each: each.error)
+        if chosen.share == 0.0:
+            self.notes.append("No share of the forces improves the validation error: the residual is 0.")
+        else:
+            self.notes.append(f"Kept: {chosen.share:.0%} of the forces, learned with noise {chosen.noise:g}.")
+        kept = {"share": chosen.share, "observation_noise": chosen.noise, "validation_error": chosen.error}
+        last = config.updates * len(config.observation_noise) + 1
+        self.log(last, {**kept, "control_steps": simulated})
+        self.save(chosen.step, chosen.policy, chosen.error)
+
+    def _labels(self, config: SupervisedConfig) -> tuple[Mapping[str, _Examples], int]:
+        """Return examples for training and validation, and the number of control steps that were simulated for them."""
+        setup, env = self.setup, self.setup.forces.config
+        robot = setup.simulator.robot
         joints = free_torques(env.forces, robot)
         config = resolve_joint_spreads(config, env.forces, setup.simulator, setup.motions.training)
         linearize = Linearizer(setup.simulator, joints, env.forces)
@@ -223,42 +245,49 @@ class _Supervised(_Fit):
                 self.show(f"labels, {use}", len(loads), len(motions), math.nan)
             found[use] = force_regression.examples(setup.simulator.simulator, motions, loads, env)
             self.notes.append(f"Labels, {use}: {_sizes(np.concatenate(loads), env.forces, robot)}.")
-        infer = jax.jit(lambda policy, seen: setup.forces.infer(setup.with_policy(policy), seen))
-        seen, actions = found.get("validation", found["training"])
-        total = config.updates * len(config.observation_noise)
-        # Without loads, all networks have the same error.
-        without = self.validate(setup.with_policy(self.zero_policy)) if 0.0 in config.force_shares else math.nan
-        candidates: list[_Candidate] = []
-        for number, noise in enumerate(config.observation_noise):
-            best = math.inf, 0, self.zero_policy
-
-            def validate(step: int, policy: Any, loss: float, before: int = number * config.updates) -> None:
-                nonlocal best
-                error = _rms(np.asarray(infer(policy, seen)) - actions) / _rms(actions)
-                best = min(best, (error, before + step, jax.device_get(policy)), key=lambda found: found[0])
-                self.log(before + step, {"loss": loss, "force_error": error})
-                self.show("learning", before + step, total, error)
-
-            if not number:
-                validate(0, self.zero_policy, float(np.mean(found["training"][1] ** 2)))
-            force_regression.regress(infer, setup.start.policy, found["training"], config, noise, validate)
-            errors = {}
-            for share in config.force_shares:
-                part = ppo.with_share(best[2], share)
-                errors[share] = self.validate(setup.with_policy(part)) if share else without
-                candidates.append(_Candidate(errors[share], noise, share, best[1], part))
-            summary = ", ".join(f"{share:.0%}: {error:.3g}" for share, error in errors.items())
-            self.notes.append(f"Validation error by share of the forces, noise {noise:g} (ratio): {summary}.")
-        chosen = min(candidates, key=lambda each: each.error)
-        if chosen.share == 0.0:
-            self.notes.append("No share of the forces improves the validation error: the residual is 0.")
-        else:
-            self.notes.append(f"Kept: {chosen.share:.0%} of the forces, learned with noise {chosen.noise:g}.")
         labelled = sum(len(motion.command) for motions in uses.values() for motion in motions)
-        simulated = labelled * (1 + linearize.directions)
-        kept = {"share": chosen.share, "observation_noise": chosen.noise, "validation_error": chosen.error}
-        self.log(total + 1, {**kept, "control_steps": simulated})
-        self.save(chosen.step, chosen.policy, chosen.error)
+        return {"validation": found["training"], **found}, labelled * (1 + linearize.directions)
+
+    def _networks(
+        self,
+        config: SupervisedConfig,
+        number: int,
+        infer: Callable[[Any, Any], Any],
+        examples: Mapping[str, _Examples],
+        without: float,
+    ) -> list[_Candidate]:
+        """Fit a network with the noise `number` on its input, and return it with each share of its forces.
+
+        `infer` returns outputs of a policy for inputs. `without` is the open-loop validation error without loads.
+        """
+        setup, noise = self.setup, config.observation_noise[number]
+        before, total = number * config.updates, config.updates * len(config.observation_noise)
+        seen, actions = examples["validation"]
+        best = math.inf, 0, self.zero_policy
+
+        def validate(step: int, policy: Any, loss: float) -> None:
+            nonlocal best
+            error = _rms(np.asarray(infer(policy, seen)) - actions) / _rms(actions)
+            best = min(best, (error, before + step, jax.device_get(policy)), key=lambda found: found[0])
+            self.log(before + step, {"loss": loss, "force_error": error})
+            self.show("learning", before + step, total, error)
+
+        if not number:
+            validate(0, self.zero_policy, float(np.mean(examples["training"][1] ** 2)))
+        force_regression.regress(infer, setup.start.policy, examples["training"], config, noise, validate)
+        _, step, policy = best
+        candidates = []
+        for share in config.force_shares:
+            part = ppo.with_share(policy, share)
+            error = self.validate(setup.with_policy(part)) if share else without
+            candidates.append(_Candidate(error, noise, share, step, part))
+        summary = ", ".join(f"{each.share:.0%}: {each.error:.3g}" for each in candidates)
+        self.notes.append(f"Validation error by share of the forces, noise {noise:g} (ratio): {summary}.")
+        return candidates
+
+
+_Examples = tuple[Float[np.ndarray, "examples inputs"], Float[np.ndarray, "examples loads"]]
+"""Inputs and outputs of the network, from `force_regression.examples`."""
 
 
 class _Candidate(NamedTuple):

@@ -23,7 +23,7 @@ import _setup
 _setup.prepare()
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import _fit
 import double_pendulum
@@ -39,10 +39,10 @@ from ballu_mjx.identification.parameters import IdentifiedParameters
 from ballu_mjx.recordings.csv_format import read_recording
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reconstruct import reconstruct_for_simulator
+from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.robots.description import read_description
 from ballu_mjx.sim.residual import Residual
 from ballu_mjx.sim.simulator import Simulator
-from ballu_mjx.viz.style import label_of
 
 NAMES = {
     "training": double_pendulum.TRAINING,
@@ -50,15 +50,28 @@ NAMES = {
     "test": double_pendulum.TEST,
 }
 """Times in the names of recordings, by use."""
-METHODS = {
-    "nominal": ("supervised", "analytic", "envmimic"),
-    "published friction": (),
-    "identified": ("envmimic",),
-}
-"""Methods that learn what the model lacks, by values of its parameters."""
-STARTED = f"{label_of('envmimic')} from supervised"
-"""Name of EnvMimic that starts with the network of *supervised* (`train envmimic --start-from`)."""
 
+
+class Method(NamedTuple):
+    """Method that learns what the model lacks."""
+
+    name: str
+    """Name of its command."""
+    start: str | None = None
+    """Row with whose networks its training starts (`train envmimic --start-from`)."""
+
+
+METHODS: Mapping[str, Mapping[str, Method]] = {
+    "nominal": {
+        "supervised": Method("supervised"),
+        "EnvMimic from supervised": Method("envmimic", start="supervised"),
+        "analytic": Method("analytic"),
+        "EnvMimic": Method("envmimic"),
+    },
+    "published friction": {},
+    "identified": {"identified, then EnvMimic": Method("envmimic")},
+}
+"""Methods by row of the tables, by values of the model's parameters."""
 
 Motions = Mapping[str, Sequence[Motion]]
 """Reconstructed recordings by use."""
@@ -169,19 +182,16 @@ def main() -> None:
         motions, evaluators = load(data, simulator, quick=quick), Evaluators(simulator)
         nothing = ConstantWrench(anchored=robot.anchored), jnp.zeros(6)
         rows[name] = [errors_of(evaluators, *nothing, motions)]
-        for method in METHODS[name]:
-            label = label_of(method) if name == "nominal" else f"{name}, then {label_of(method)}"
-            print(f"{label}:", flush=True)
+        learned: dict[str, list[TrainedResidual]] = {}
+        for row, method in METHODS[name].items():
+            print(f"{row}:", flush=True)
             uses = motions["training"], motions["validation"]
-            learned = [learn_network(method, simulator, *uses, "joints", seed, quick=quick) for seed in seeds]
-            rows[label] = [errors_of(evaluators, each.model, each.params, motions) for each in learned]
-            if method == "supervised":
-                print(f"{STARTED}:", flush=True)
-                started = [
-                    learn_network("envmimic", simulator, *uses, "joints", seed, quick=quick, start_from=begun)
-                    for seed, begun in zip(seeds, learned, strict=True)
-                ]
-                rows[STARTED] = [errors_of(evaluators, each.model, each.params, motions) for each in started]
+            starts = [None] * len(seeds) if method.start is None else learned[method.start]
+            learned[row] = [
+                learn_network(method.name, simulator, *uses, "joints", seed, quick=quick, start_from=start)
+                for seed, start in zip(seeds, starts, strict=True)
+            ]
+            rows[row] = [errors_of(evaluators, each.model, each.params, motions) for each in learned[row]]
     _setup.write_tables(tables(rows), options.output, options.results, {"training": seeds})
 
 
