@@ -23,28 +23,21 @@ BLIMP_COLUMNS = (*(f"{kind}_{k}" for kind in ("p", "e", "rb_series") for k in (1
 WALK_VARIABLES = ("datatime", "hipangle", "innoutst", "stanceangle", "umaxonsatu")
 
 
-@pytest.fixture(scope="module")
-def pendulum() -> Iterator[ModuleType]:
-    with experiment_module(REAL / "double_pendulum" / "double_pendulum.py") as module:
-        yield module
+def experiment(script: str) -> Callable[..., Iterator[ModuleType]]:
+    """Return a fixture with an experiment as a module."""
+
+    @pytest.fixture(scope="module")
+    def loaded() -> Iterator[ModuleType]:
+        with experiment_module(REAL / script) as module:
+            yield module
+
+    return loaded
 
 
-@pytest.fixture(scope="module")
-def motor() -> Iterator[ModuleType]:
-    with experiment_module(REAL / "go1" / "go1.py") as module:
-        yield module
-
-
-@pytest.fixture(scope="module")
-def walker() -> Iterator[ModuleType]:
-    with experiment_module(REAL / "compass_gait" / "compass_gait.py") as module:
-        yield module
-
-
-@pytest.fixture(scope="module")
-def blimp() -> Iterator[ModuleType]:
-    with experiment_module(REAL / "rgblimp" / "rgblimp.py") as module:
-        yield module
+pendulum = experiment("double_pendulum/double_pendulum.py")
+motor = experiment("go1/go1.py")
+walker = experiment("compass_gait/compass_gait.py")
+blimp = experiment("rgblimp/rgblimp.py")
 
 
 def write_table(path: Path, columns: tuple[str, ...], rows: np.ndarray) -> Path:

@@ -50,7 +50,7 @@ from typing import Any, NamedTuple
 import _public
 import jax.numpy as jnp
 import numpy as np
-from _constant_wrench import fit_constant_wrench
+from _constant_wrench import ConstantWrench, fit_constant_wrench
 from jaxtyping import Array, Float, Int
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
@@ -65,7 +65,7 @@ from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.residuals.body_motion import body_motion
 from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.robots.description import RobotDescription, read_description
-from ballu_mjx.sim.residual import Action, Commands, History, Residual
+from ballu_mjx.sim.residual import Action, Commands, History, Residual, SumOfResiduals
 from ballu_mjx.sim.simulator import Simulator
 from ballu_mjx.viz import plots
 
@@ -128,6 +128,10 @@ SHORT = ("no air", "published model", "fluid", "fluid, then supervised", "EnvMim
 """Rows of the short table."""
 MEANS = ("published model", "fluid")
 """Methods whose mean yaw errors are listed by thrusts."""
+TRIMMED = "fluid, yaw moment from the group"
+"""Row of `trimmed_errors`."""
+SMALL_MOMENT = 5e-4
+"""Yaw moment for the derivative of the yaw error (N m). The thrusters' moment in a spiral is 6e-3 N m."""
 SHOWN = 20.0
 """Length of the flights in the figure (s)."""
 FULL_THRUST, FIRST_PLACE, TRAVEL = 0.07, 0.0647, 0.05
@@ -252,14 +256,17 @@ Rows = Mapping[str, Mapping[str, Sequence[Found]]]
 
 
 def errors_at(
-    evaluator: OpenLoopEvaluator, replay: Replay, horizon: float
+    evaluator: OpenLoopEvaluator, replay: Replay, horizon: float, flights: Sequence[int]
 ) -> tuple[Int[np.ndarray, " starts"], Float[np.ndarray, "starts 2"]]:
-    """Return the recording of each start, and the distance (m) and signed yaw error (deg) after `horizon` (s)."""
+    """Return the flight of each start, and the distance (m) and signed yaw error (deg) after `horizon` (s).
+
+    `flights` are numbers of flights among those of `evaluator`.
+    """
     steps = round(horizon / evaluator.robot.control_timestep)
     recordings, errors = [], []
     for run, (recording, _) in enumerate(evaluator.starts):
         position, yaw = evaluator.recorded(run)
-        if len(position) > steps:
+        if recording in flights and len(position) > steps:
             turn = replay.yaw[run, steps] - yaw[steps]
             far = np.linalg.norm(replay.position[run, steps] - position[steps])
             recordings.append(recording)
@@ -267,33 +274,61 @@ def errors_at(
     return np.array(recordings, int), np.array(errors).reshape(-1, 2)
 
 
-def end_errors(evaluator: OpenLoopEvaluator, replay: Replay, flights: range) -> Found:
+def end_errors(evaluator: OpenLoopEvaluator, replays: Sequence[tuple[Replay, Sequence[int]]]) -> Found:
     """Return root mean square errors of position (m) and yaw (deg) at each horizon's end, and numbers of starts.
 
-    `flights` are the numbers of the flights among those of `evaluator`.
+    `replays` are replays, each with the numbers of the flights that count (among those of `evaluator`).
     """
     found = {}
     for horizon in HORIZONS:
-        recordings, table = errors_at(evaluator, replay, horizon)
-        table = table[np.isin(recordings, flights)]
+        table = np.concatenate([errors_at(evaluator, replay, horizon, flights)[1] for replay, flights in replays])
         kept = table[np.isfinite(table).all(axis=1)]
         rms = np.sqrt(np.mean(kept**2, axis=0)) if len(kept) else np.full(2, np.inf)
         found[horizon] = float(rms[0]), float(rms[1]), len(table), len(table) - len(kept)
     return found
 
 
-def mean_yaw_errors(evaluator: OpenLoopEvaluator, replay: Replay, flights: range) -> dict[str, float]:
+def mean_yaw_errors(evaluator: OpenLoopEvaluator, replay: Replay, flights: Sequence[int]) -> dict[str, float]:
     """Return the mean signed yaw error (deg) at the last horizon's end, by thrusts of the flights.
 
     `flights` are the numbers of the flights among those of `evaluator`.
     """
     by_thrusts: dict[str, list[float]] = {}
-    for recording, (_, turn) in zip(*errors_at(evaluator, replay, HORIZONS[-1]), strict=True):
-        if recording not in flights:
-            continue
+    for recording, (_, turn) in zip(*errors_at(evaluator, replay, HORIZONS[-1], flights), strict=True):
         left, right = FULL_THRUST * evaluator.motions[recording].command[0, :2]
         by_thrusts.setdefault(f"{left:.4f} and {right:.4f} N", []).append(turn)
     return {thrusts: float(np.mean(turns)) for thrusts, turns in by_thrusts.items()}
+
+
+def trimmed_errors(
+    evaluators: Evaluators, fluid: tuple[Residual, Any], flown: Sequence[Motion], places: Mapping[str, range]
+) -> tuple[dict[str, Found], dict[str, tuple[float, float]]]:
+    """Return the errors of fluid forces with a constant yaw moment from other flights of the same group.
+
+    Each half of a group has the moment for which the mean yaw error of the other half is 0 at the last horizon's end,
+    to first order. This is no prediction from training flights. It shows how much of the error one number explains.
+
+    **Returns** errors and both moments (N m), by group.
+    """
+    model, params = fluid
+    evaluator = evaluators.of(SumOfResiduals(model, ConstantWrench(anchored=False)), flown)
+
+    def replay(moment: float) -> Replay:
+        return evaluator.replay((params, jnp.zeros(6).at[5].set(moment)), seconds=HORIZONS[-1])
+
+    def mean_yaw(replay: Replay, half: Sequence[int]) -> float:
+        return float(np.mean(errors_at(evaluator, replay, HORIZONS[-1], half)[1][:, 1]))
+
+    before, after = replay(0.0), replay(SMALL_MOMENT)
+    errors, moments = {}, {}
+    for group, place in places.items():
+        halves = place[::2], place[1::2]
+        without = [mean_yaw(before, half) for half in halves]
+        changes = [mean_yaw(after, half) - there for half, there in zip(halves, without, strict=True)]
+        own = [-SMALL_MOMENT * there / change for there, change in zip(without, changes, strict=True)]
+        moments[group] = own[0], own[1]
+        errors[group] = end_errors(evaluator, [(replay(own[1]), halves[0]), (replay(own[0]), halves[1])])
+    return errors, moments
 
 
 def neighbour_errors(
@@ -486,10 +521,15 @@ def main() -> None:
         if not rows:
             replays = {"no air": [evaluator.replay(runs[0][1], scale=0.0, seconds=HORIZONS[-1])]} | replays
         for each, found in replays.items():
-            rows[each] = {g: [end_errors(evaluator, replay, place) for replay in found] for g, place in places.items()}
+            rows[each] = {
+                group: [end_errors(evaluator, [(replay, place)]) for replay in found] for group, place in places.items()
+            }
         if name in MEANS:
             turns = {group: mean_yaw_errors(evaluator, replays[name][0], places[group]) for group in TEST}
             means[name] = {f"{group}, {thrusts}": turn for group in TEST for thrusts, turn in turns[group].items()}
+    trimmed, moments = trimmed_errors(evaluators, residuals["fluid"][0], flown, places)
+    print(f"yaw moments of the halves of each group (N m): {moments}", flush=True)
+    rows[TRIMMED] = {group: [found] for group, found in trimmed.items()}
     rows["nearest moments"] = {
         group: [neighbour_errors(training, flown, robot.control_timestep)] for group, flown in groups.items()
     }
