@@ -11,6 +11,7 @@ import jax
 
 from ballu_mjx.cli._command import load_chosen_robot, open_run, written_to
 from ballu_mjx.common import files
+from ballu_mjx.common.errors import InputError
 from ballu_mjx.evaluation.open_loop import Evaluators
 from ballu_mjx.identification.actuator_choice import choose_actuators
 from ballu_mjx.identification.stable_time_step import check_stability
@@ -46,6 +47,19 @@ class EarlierRun(NamedTuple):
         **Raises** `InputError` from `TrainedResidual.load`.
         """
         return EarlierRun(folder, TrainedResidual.load(folder, robot))
+
+
+def load_earlier(folder: Path | None, robot: RobotDescription, kind: type, task: str) -> EarlierRun | None:
+    """Return the run of --fixed-from, whose residual must be of a kind. None if `folder` is None.
+
+    **Raises** `InputError` if it is of another kind than that of the command `task`.
+    """
+    if folder is None:
+        return None
+    found = EarlierRun.load(folder, robot)
+    if not isinstance(found.residual.model, kind):
+        raise InputError(f"{folder}: is no run of `train {task}`; give --fixed-from one of its runs.")
+    return found
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ballu_mjx.cli._command import TrainCommand, load_chosen_robot
-from ballu_mjx.cli._residual import EarlierRun, Prepared, show_report, train_residual
+from ballu_mjx.cli._residual import Prepared, load_earlier, show_report, train_residual
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.residuals.aerodynamics import AIR_PARAMETERS, Aerodynamics
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, check_air_config
 from ballu_mjx.residuals.aerodynamics_training import fit_aerodynamics
 from ballu_mjx.residuals.dataset import RecordingsData
 from ballu_mjx.residuals.trained_residual import TrainedResidual
-from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.runs.progress import PhaseProgress
 from ballu_mjx.runs.record import TrainingRecord
 
@@ -42,7 +41,7 @@ def train(data: AirData, fit: AirConfig) -> int:
     check_air_config(fit, robot.control_timestep)
     if not data.free:
         raise InputError(f"--free names no parameter; choose from {', '.join(AIR_PARAMETERS)}.")
-    earlier = _earlier(data, robot)
+    earlier = load_earlier(data.fixed_from, robot, Aerodynamics, "aerodynamic")
 
     def learn(prepared: Prepared, run: TrainingRecord) -> TrainedResidual:
         return fit_aerodynamics(
@@ -59,16 +58,6 @@ def train(data: AirData, fit: AirConfig) -> int:
         return {"fit": fit, "data": data}
 
     return train_residual("aerodynamic", data, sections, learn, show_report, earlier=earlier)
-
-
-def _earlier(data: AirData, robot: RobotDescription) -> EarlierRun | None:
-    """Return the run of --fixed-from. None without this option."""
-    if data.fixed_from is None:
-        return None
-    found = EarlierRun.load(data.fixed_from, robot)
-    if not isinstance(found.residual.model, Aerodynamics):
-        raise InputError(f"{data.fixed_from}: is no run of `train aerodynamic`; give --fixed-from one of its runs.")
-    return found
 
 
 COMMAND = TrainCommand(

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from ballu_mjx.cli._command import TrainCommand, load_chosen_robot
-from ballu_mjx.cli._residual import Prepared, show_report, train_residual
+from ballu_mjx.cli._residual import Prepared, load_earlier, show_report, train_residual
 from ballu_mjx.residuals.dataset import RecordingsData
+from ballu_mjx.residuals.fluid import FluidResidual
 from ballu_mjx.residuals.fluid_fit import FluidConfig, check_fluid_config
 from ballu_mjx.residuals.fluid_training import fit_fluid
 from ballu_mjx.residuals.trained_residual import TrainedResidual
@@ -18,23 +21,53 @@ QUICK: Mapping[str, Any] = {"terms": "linear", "window_seconds": (0.5,), "window
 """Defaults of `FluidConfig` under `--quick`."""
 
 
-def train(data: RecordingsData, fit: FluidConfig) -> int:
+@dataclasses.dataclass(frozen=True)
+class FluidData(RecordingsData):
+    """Recordings and folders. A path is a recording (.csv or .csv.gz) or a folder of them."""
+
+    fixed_from: Path | None = None
+    """Folder of an earlier run of `train fluid`. Its forces are kept, and only a constant force and torque in the body
+    frame are fitted: the trim, which changes from day to day. Minutes of recordings determine it. The actuators are
+    those of that run, unless --actuators names others. Without this option: all forces are fitted."""
+
+
+def train(data: FluidData, fit: FluidConfig) -> int:
     """Read and check all inputs, fit, evaluate the result, and return the exit status."""
-    check_fluid_config(fit, load_chosen_robot(data.robot).control_timestep)
+    robot = load_chosen_robot(data.robot, residual=data.fixed_from)
+    check_fluid_config(fit, robot.control_timestep)
+    earlier = load_earlier(data.fixed_from, robot, FluidResidual, "fluid")
 
     def learn(prepared: Prepared, run: TrainingRecord) -> TrainedResidual:
         motions = prepared.motions
         return fit_fluid(
-            prepared.simulator, motions["training"], motions["validation"], fit, run=run, progress=PhaseProgress()
+            prepared.simulator,
+            motions["training"],
+            motions["validation"],
+            fit,
+            fixed_from=None if earlier is None else earlier.residual,
+            run=run,
+            progress=PhaseProgress(),
         )
 
-    return train_residual("fluid", data, lambda prepared: {"fit": fit, "data": data}, learn, show_report)
+    def sections(prepared: Prepared) -> Mapping[str, Any]:
+        return {"fit": fit, "data": data}
+
+    return train_residual("fluid", data, sections, learn, show_report, earlier=earlier)
+
+
+def _defaults(data: FluidData) -> Mapping[str, Mapping[str, Any]]:
+    """Return the defaults that --quick implies. The terms of --fixed-from stay."""
+    if not data.quick:
+        return {}
+    kept = () if data.fixed_from is None else ("terms",)
+    return {"fit": {name: value for name, value in QUICK.items() if name not in kept}}
 
 
 COMMAND = TrainCommand(
     "Fit the force and torque on the tracked body as polynomials of its velocity: lift, drag, side force, moments and "
     "rotary damping. For any body in air or water.",
-    {"data": RecordingsData(), "fit": FluidConfig()},
+    {"data": FluidData(), "fit": FluidConfig()},
     train,
     {"fit": QUICK},
+    _defaults,
 )

@@ -119,6 +119,12 @@ class FluidParameters:
         return FluidParameters(coefficients, np.zeros(()), np.zeros(3))
 
 
+def all_terms(params: FluidParameters) -> FluidParameters:
+    """Return parameters with the coefficients of all terms of the largest set. Those of other terms are 0."""
+    missing = len(terms_of(TERM_SETS[-1])) - len(params.coefficients)
+    return dataclasses.replace(params, coefficients=np.pad(np.asarray(params.coefficients), [(0, missing), (0, 0)]))
+
+
 class FluidResidual(Residual):
     """Fluid residual (`sim.residual.Residual`). Its parameters are `FluidParameters`."""
 
@@ -135,7 +141,8 @@ class FluidResidual(Residual):
         - `added_mass`: whether the residual changes the tracked body's mass and inertia. If not, the residual ignores
           these parameters.
         """
-        self.robot, self.term_set, self.terms, self.added_mass = robot, term_set, terms_of(term_set), added_mass
+        self.robot, self.terms, self.added_mass = robot, terms_of(term_set), added_mass
+        self.term_set: TermSet = term_set
         gravity = np.asarray(model.opt.gravity)
         size = float(np.linalg.norm(gravity))
         self._down = jnp.asarray(gravity / size if size > 0 else gravity)
@@ -185,12 +192,12 @@ class FluidEstimate:
     term_set: TermSet
     values: FluidParameters
     standard_errors: FluidParameters
-    """Standard errors. 0 for parameters that are fixed at 0."""
+    """Standard errors. 0 for parameters that were not fitted."""
 
     @property
     def added_mass(self) -> bool:
-        """Whether the added mass was identified."""
-        return bool(self.standard_errors.added_mass > 0)
+        """Whether there is an added mass."""
+        return bool(self.values.added_mass > 0)
 
     def residual(self, robot: RobotDescription, model: mujoco.MjModel) -> FluidResidual:
         """Return the residual of these parameters, for the C model of `robot` without the residual."""

@@ -31,13 +31,22 @@ from ballu_mjx.recordings.motion_windows import (
     simulate_motion_window,
 )
 from ballu_mjx.recordings.window_errors import OUTLIER_THRESHOLD, fill_diverged, pseudo_huber
-from ballu_mjx.residuals.fluid import TERM_SETS, FluidEstimate, FluidParameters, FluidResidual, TermSet, terms_of
+from ballu_mjx.residuals.fluid import (
+    TERM_SETS,
+    FluidEstimate,
+    FluidParameters,
+    FluidResidual,
+    TermSet,
+    all_terms,
+    terms_of,
+)
 from ballu_mjx.residuals.fluid_parametrization import (
     PASSIVE_SETS,
     AddedMass,
     FluidParametrization,
     FreeCoefficients,
     PassiveCoefficients,
+    TrimParametrization,
 )
 from ballu_mjx.sim.observation import HISTORY
 from ballu_mjx.sim.residual import BoundResidual
@@ -100,7 +109,7 @@ class FluidFit:
     estimate: FluidEstimate
     scores: dict[str, float]
     """Robust RMS error on the validation windows, in units of the expected error, by set of terms. The key `none` is
-    the error without residual."""
+    the error without residual. Of a trim: that of the earlier result, and that with the trim."""
     symmetric: bool
     """Whether the forces are symmetric about the xz plane."""
     windows: int
@@ -119,6 +128,7 @@ def fit_fluid_forces(
     validation: Sequence[Motion],
     config: FluidConfig,
     report: Report = lambda stage, iteration, steps, loss: None,
+    fixed_from: FluidEstimate | None = None,
 ) -> FluidFit:
     """Fit the parameters of the fluid residual.
 
@@ -129,10 +139,15 @@ def fit_fluid_forces(
     - `validation`: motions that choose the set of terms.
     - `config`: options of the fit.
     - `report`: function that is called after every iteration.
+    - `fixed_from`: earlier result. Its parameters are kept, and only a trim is fitted (`TrimParametrization`).
+      `config.passive`, `config.added_mass` and `config.mirror` then have no effect. If None, all parameters are fitted.
 
-    **Raises** `InputError` for options out of range, and if no motion is as long as a window.
+    **Raises** `InputError` for options out of range, if `config.terms` differs from those of `fixed_from`, and if no
+    motion is as long as a window.
     """
     check_fluid_config(config, simulator.control_timestep)
+    if fixed_from is not None:
+        return _fit_trim(simulator, training, validation, config, report, fixed_from)
     centre, added = _centre(simulator), _added_mass(simulator) if config.added_mass else None
     program = _Program(simulator, added_mass=added is not None)
     windows, held_out = (_Windows(simulator, motions, config, program) for motions in (training, validation))
@@ -165,6 +180,33 @@ def fit_fluid_forces(
             best = scores[name], FluidEstimate(name, *kept)
     assert best is not None
     return FluidFit(best[1], scores, symmetric, windows.count, program.control_steps)
+
+
+def _fit_trim(
+    simulator: Simulator,
+    training: Sequence[Motion],
+    validation: Sequence[Motion],
+    config: FluidConfig,
+    report: Report,
+    known: FluidEstimate,
+) -> FluidFit:
+    """Fit a trim in addition to the `known` parameters."""
+    name = known.term_set
+    if config.terms not in ("auto", name):
+        raise InputError(f"--terms {config.terms} differs from {name}, the terms of the earlier result; leave it out.")
+    program = _Program(simulator, added_mass=known.added_mass)
+    windows, held_out = (_Windows(simulator, motions, config, program) for motions in (training, validation))
+    parametrization = TrimParametrization(all_terms(known.values), _priors(windows, config.spread))
+    search = _Search(windows, parametrization)
+    vector = search.run(parametrization.start, config, lambda *progress: report(f"trim, {progress[0]}", *progress[1:]))
+    found, errors = parametrization.parameters(vector), search.standard_errors(vector)
+    scores = {
+        "earlier": held_out.score(parametrization.parameters(parametrization.start)),
+        "with the trim": held_out.score(found),
+    }
+    shown = slice(len(terms_of(name)))
+    kept = [dataclasses.replace(each, coefficients=each.coefficients[shown]) for each in (found, errors)]
+    return FluidFit(FluidEstimate(name, kept[0], kept[1]), scores, False, windows.count, program.control_steps)
 
 
 def _thin(windows: MotionWindows, most: int) -> MotionWindows:
@@ -265,7 +307,7 @@ def _single(parameters: FluidParameters) -> FluidParameters:
 class _Search:
     """Fit of one set of terms."""
 
-    def __init__(self, windows: _Windows, parametrization: FluidParametrization) -> None:
+    def __init__(self, windows: _Windows, parametrization: FluidParametrization | TrimParametrization) -> None:
         self._windows, self._parametrization = windows, parametrization
 
     def run(self, start: Float[np.ndarray, " size"], config: FluidConfig, report: Report) -> Float[np.ndarray, " size"]:

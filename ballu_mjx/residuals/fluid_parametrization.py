@@ -19,6 +19,7 @@ Added masses and inertias are exponentials, so that they are never negative.
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections.abc import Callable
 from typing import NamedTuple, Protocol
@@ -28,7 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ballu_mjx.residuals.fluid import TERM_SETS, FluidParameters, TermSet, symmetric_mask, terms_of
+from ballu_mjx.residuals.fluid import TERM_SETS, FluidParameters, Term, TermSet, symmetric_mask, terms_of
 
 PASSIVE_SETS: tuple[TermSet, ...] = ("linear", "drag", "quadratic")
 """Sets of terms for which passive coefficients exist."""
@@ -95,6 +96,37 @@ class FluidParametrization:
             mass[0] = ADDED_SPREAD * now.added_mass
             inertia[1:4] = np.diag(ADDED_SPREAD * now.added_inertia)
         return FluidParameters(coefficients, mass, inertia)
+
+
+class TrimParametrization:
+    """Parametrization of a trim in addition to known parameters, by a vector with standard normal priors.
+
+    The trim is a force and a torque that are constant in the body frame while the body is upright: coefficients of the
+    vertical component of the direction of gravity. A known symmetry does not limit it.
+    """
+
+    def __init__(self, known: FluidParameters, prior: Float[np.ndarray, "terms 6"]) -> None:
+        """Prepare the parametrization.
+
+        **Arguments**
+
+        - `known`: the known parameters, with the coefficients of all terms of the largest set.
+        - `prior`: standard deviation of each coefficient's prior (SI units).
+        """
+        vertical = terms_of(TERM_SETS[-1]).index(Term(("gz",), 0))
+        axes = np.arange(prior.shape[1])
+        self._known, self._directions = known, np.zeros((len(axes), *prior.shape))
+        self._directions[axes, vertical, axes] = prior[vertical]
+        self.start = np.zeros(len(axes))
+
+    def parameters(self, vector: Float[np.ndarray, " size"]) -> FluidParameters:
+        """Return the parameters, with the coefficients of all terms of the largest set."""
+        table = self._known.coefficients + np.tensordot(vector, self._directions, 1)
+        return dataclasses.replace(self._known, coefficients=table)
+
+    def directions(self, vector: Float[np.ndarray, " size"]) -> FluidParameters:
+        """Return the derivatives of the parameters with respect to the entries of the vector, the leading axis."""
+        return FluidParameters(self._directions, np.zeros(len(vector)), np.zeros((len(vector), 3)))
 
 
 class FreeCoefficients:

@@ -15,13 +15,14 @@ import pytest
 from ballu_mjx import __main__ as package
 from ballu_mjx import cli
 from ballu_mjx.__main__ import COMMANDS, NAMES
-from ballu_mjx.cli import completion, train, train_envmimic, train_forces
+from ballu_mjx.cli import completion, train, train_envmimic, train_fluid, train_forces
 from ballu_mjx.cli._command import TrainCommand, run_command
 from ballu_mjx.common import runtime
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.importers.readers import READERS
 from ballu_mjx.residuals.dataset import RecordingsData
 from ballu_mjx.residuals.envmimic import EnvMimicConfig
+from ballu_mjx.residuals.fluid_fit import FluidConfig
 from ballu_mjx.residuals.force_gradients import AnalyticConfig
 from ballu_mjx.residuals.force_regression import SupervisedConfig
 from ballu_mjx.residuals.network_config import ForceNetworkConfig
@@ -107,6 +108,7 @@ def test_traceback_of_an_input_error_is_shown_with_debug(line: str, capsys: pyte
         ("train supervised", ("--force-shares", "--forces", "--robot", "--actuators")),
         ("train analytic", ("--relinearizations", "--forces", "--robot")),
         ("train aerodynamic", ("--fixed-from", "--free", "--robot")),
+        ("train fluid", ("--fixed-from", "--terms", "--robot")),
         ("train walk", ("--keep-every", "--robot", "--residual", "--domain-randomization")),
         ("train sysid", ("--levels", "--robot", "--objective")),
     ],
@@ -245,6 +247,20 @@ def test_regression_and_gradients_take_all_options_of_the_network(command: Train
     ):
         with pytest.raises(InputError, match=message):
             run_command({"learn": command}, ["learn", *line.split()], "")
+
+
+def test_a_quick_trim_keeps_the_terms_of_the_earlier_run(tmp_path: Path):
+    found = []
+
+    def keep(data: train_fluid.FluidData, fit: FluidConfig) -> int:
+        found.append(fit)
+        return 0
+
+    command = {"fluid": dataclasses.replace(train_fluid.COMMAND, run=keep)}
+    run_command(command, ["fluid", "--quick", "--fixed-from", str(tmp_path)], "")
+    run_command(command, ["fluid", "--quick"], "")
+    assert [fit.terms for fit in found] == ["auto", "linear"]
+    assert found[0] == dataclasses.replace(found[1], terms="auto")
 
 
 def test_a_network_to_start_with_sets_its_own_options(tmp_path: Path):

@@ -57,6 +57,7 @@ COMMANDS = (
     "export policy RUN --output RUN",
     "export simulator RUN --output RUN",
     "train aerodynamic --fixed-from RUN --recordings nowhere",
+    "train fluid --fixed-from RUN --recordings nowhere",
     "train supervised --actuators RUN --recordings ONE",
     "train supervised --output RUN --recordings ONE",
 )

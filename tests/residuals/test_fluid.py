@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from plain_push import PlainPush
 from robot_files import write_robot
 from scipy import optimize
 
@@ -36,6 +37,9 @@ from ballu_mjx.residuals.fluid_fit import (
     robust_least_squares,
 )
 from ballu_mjx.residuals.fluid_parametrization import PASSIVE_SETS, PassiveCoefficients
+from ballu_mjx.residuals.fluid_training import fit_fluid
+from ballu_mjx.residuals.trained_residual import TrainedResidual
+from ballu_mjx.residuals.training_range import TrainingRange
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.observation import HISTORY
 from ballu_mjx.sim.residual import BoundResidual
@@ -56,6 +60,7 @@ ADDED = 0.16, np.array([0.003, 0.004, 0.01])
 """Mass (kg) and moments of inertia (kg m^2) of the air that the glider drags along."""
 LIFT = 0.15
 """Lift coefficient (N s^2/m^2): upward force per product of forward and downward velocity."""
+NO_TRIM = np.zeros(6)
 
 
 @pytest.fixture(scope="module")
@@ -65,8 +70,11 @@ def glider(tmp_path_factory: pytest.TempPathFactory) -> RobotDescription:
     return write_robot(folder, "glider", GLIDER, tracked="hull", commands=commands, mirror={"left": "right"})
 
 
-def flights(robot: RobotDescription, seed: int, count: int) -> list[Motion]:
-    """Simulate flights in C MuJoCo, with added mass, and with drag and lift in every physics step."""
+def flights(robot: RobotDescription, seed: int, count: int, trim: np.ndarray = NO_TRIM) -> list[Motion]:
+    """Simulate flights in C MuJoCo, with added mass, and with drag, lift and a constant wrench in every physics step.
+
+    The wrench `trim` (N, N m) is in the body frame.
+    """
     model, rng = robot.load_model(), np.random.default_rng(seed)
     model.body_mass[1] += ADDED[0]
     model.body_inertia[1] += ADDED[1]
@@ -84,8 +92,9 @@ def flights(robot: RobotDescription, seed: int, count: int) -> list[Motion]:
                 velocity = frame.T @ data.qvel[:3]
                 forward, _, up = velocity
                 # The lift is perpendicular to the velocity.
-                force = -LINEAR * velocity + LIFT * up * np.array([up, 0, -forward])
-                data.xfrc_applied[1] = np.concatenate([frame @ force, frame @ (-TURNING * data.qvel[3:])])
+                force = -LINEAR * velocity + LIFT * up * np.array([up, 0, -forward]) + trim[:3]
+                torque = -TURNING * data.qvel[3:] + trim[3:]
+                data.xfrc_applied[1] = np.concatenate([frame @ force, frame @ torque])
                 data.ctrl[:] = command
                 mujoco.mj_step(model, data)
         states.append((data.qpos.copy(), data.qvel.copy()))
@@ -122,6 +131,37 @@ def test_fit_recovers_the_added_mass(fit: FluidFit):
     assert found.added_mass == pytest.approx(ADDED[0], rel=0.15)
     assert found.added_inertia[2] == pytest.approx(ADDED[1][2], rel=0.25)
     assert errors.added_mass < 0.2 * ADDED[0]
+
+
+@pytest.mark.slow
+def test_a_trim_is_found_from_one_flight(glider: RobotDescription):
+    """The earlier forces are the true ones. Now the robot is heavier, and one thruster is weaker."""
+    names = [term.name for term in terms_of("quadratic")]
+    table = np.zeros((len(names), 6))
+    for axes, factors, values in ((slice(0, 3), "vx vy vz", LINEAR), (slice(3, 6), "wx wy wz", TURNING)):
+        table[[names.index(factor) for factor in factors.split()], axes] = -np.diag(values)
+    table[names.index("vx*vz"), 2], table[names.index("vz*vz"), 0] = -LIFT, LIFT
+    values = FluidParameters(table, np.asarray(ADDED[0]), ADDED[1])
+    known = FluidEstimate("quadratic", values, jax.tree.map(np.zeros_like, values))
+    trim = np.array([-0.004, 0.0, -0.015, 0.0, 0.0, 0.0008])
+    simulator, now, later = Simulator(glider), flights(glider, 2, 1, trim), flights(glider, 3, 2, trim)
+    found = fit_fluid_forces(simulator, now, later, FluidConfig(window_seconds=(1.0,), steps=6), fixed_from=known)
+    vertical = found.estimate.values.coefficients[names.index("gz")]
+    np.testing.assert_allclose(-vertical, trim, atol=0.15 * np.abs(trim).max(), rtol=0.15)
+    assert -vertical[5] == pytest.approx(trim[5], rel=0.15)
+    others = np.delete(found.estimate.values.coefficients, names.index("gz"), axis=0)
+    np.testing.assert_array_equal(others, np.delete(table, names.index("gz"), axis=0))
+    assert found.estimate.values.added_mass == ADDED[0] and found.estimate.added_mass
+    assert found.scores["with the trim"] < 0.2 * found.scores["earlier"]
+    with pytest.raises(InputError, match="--terms cubic differs from quadratic"):
+        fit_fluid_forces(simulator, now, later, FluidConfig("cubic", passive=False), fixed_from=known)
+
+
+def test_a_trim_needs_fluid_forces_with_the_same_actuators(glider: RobotDescription):
+    simulator = Simulator(glider)
+    other = TrainedResidual(PlainPush(), jnp.zeros(3), TrainingRange.unbounded(), 0, None)
+    with pytest.raises(InputError, match="is of the kind push, not fluid"):
+        fit_fluid(simulator, [], [], fixed_from=other)
 
 
 @pytest.mark.slow

@@ -50,7 +50,7 @@ from typing import Any, NamedTuple
 import _public
 import jax.numpy as jnp
 import numpy as np
-from _constant_wrench import ConstantWrench, fit_constant_wrench
+from _constant_wrench import fit_constant_wrench
 from jaxtyping import Array, Float, Int
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
@@ -63,9 +63,12 @@ from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.residuals.body_motion import body_motion
+from ballu_mjx.residuals.fluid_fit import FluidConfig
+from ballu_mjx.residuals.fluid_training import fit_fluid
 from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.robots.description import RobotDescription, read_description
-from ballu_mjx.sim.residual import Action, Commands, History, Residual, SumOfResiduals
+from ballu_mjx.runs.progress import PhaseProgress
+from ballu_mjx.sim.residual import Action, Commands, History, Residual
 from ballu_mjx.sim.simulator import Simulator
 from ballu_mjx.viz import plots
 
@@ -128,10 +131,8 @@ SHORT = ("no air", "published model", "fluid", "fluid, then supervised", "EnvMim
 """Rows of the short table."""
 MEANS = ("published model", "fluid")
 """Methods whose mean yaw errors are listed by thrusts."""
-TRIMMED = "fluid, yaw moment from the group"
+TRIMMED = "fluid, trimmed on its group"
 """Row of `trimmed_errors`."""
-SMALL_MOMENT = 5e-4
-"""Yaw moment for the derivative of the yaw error (N m). The thrusters' moment in a spiral is 6e-3 N m."""
 SHOWN = 20.0
 """Length of the flights in the figure (s)."""
 FULL_THRUST, FIRST_PLACE, TRAVEL = 0.07, 0.0647, 0.05
@@ -301,34 +302,25 @@ def mean_yaw_errors(evaluator: OpenLoopEvaluator, replay: Replay, flights: Seque
 
 
 def trimmed_errors(
-    evaluators: Evaluators, fluid: tuple[Residual, Any], flown: Sequence[Motion], places: Mapping[str, range]
-) -> tuple[dict[str, Found], dict[str, tuple[float, float]]]:
-    """Return the errors of fluid forces with a constant yaw moment from other flights of the same group.
+    simulator: Simulator, fluid: TrainedResidual, evaluator: OpenLoopEvaluator, places: Mapping[str, range]
+) -> dict[str, Found]:
+    """Return the errors of fluid forces with a trim from other flights of the same group, by group.
 
-    Each half of a group has the moment for which the mean yaw error of the other half is 0 at the last horizon's end,
-    to first order. This is no prediction from training flights. It shows how much of the error one number explains.
-
-    **Returns** errors and both moments (N m), by group.
+    Each half of a group is replayed with the trim that is fitted to the other half (`train fluid --fixed-from`). This
+    is no prediction from the training flights. It shows how much of the error a constant force and torque explain.
     """
-    model, params = fluid
-    evaluator = evaluators.of(SumOfResiduals(model, ConstantWrench(anchored=False)), flown)
-
-    def replay(moment: float) -> Replay:
-        return evaluator.replay((params, jnp.zeros(6).at[5].set(moment)), seconds=HORIZONS[-1])
-
-    def mean_yaw(replay: Replay, half: Sequence[int]) -> float:
-        return float(np.mean(errors_at(evaluator, replay, HORIZONS[-1], half)[1][:, 1]))
-
-    before, after = replay(0.0), replay(SMALL_MOMENT)
-    errors, moments = {}, {}
+    config = FluidConfig(window_seconds=(HORIZONS[-1],), windows=40, steps=10)
+    errors = {}
     for group, place in places.items():
         halves = place[::2], place[1::2]
-        without = [mean_yaw(before, half) for half in halves]
-        changes = [mean_yaw(after, half) - there for half, there in zip(halves, without, strict=True)]
-        own = [-SMALL_MOMENT * there / change for there, change in zip(without, changes, strict=True)]
-        moments[group] = own[0], own[1]
-        errors[group] = end_errors(evaluator, [(replay(own[1]), halves[0]), (replay(own[0]), halves[1])])
-    return errors, moments
+        replays = []
+        for own, other in (halves, halves[::-1]):
+            motions = [evaluator.motions[flight] for flight in other]
+            found = fit_fluid(simulator, motions, motions, config, fixed_from=fluid, progress=PhaseProgress())
+            print(f"\n{group}, flights {tuple(other)}:\n{found.report}\n", flush=True)
+            replays.append((evaluator.replay(found.params, seconds=HORIZONS[-1]), own))
+        errors[group] = end_errors(evaluator, replays)
+    return errors
 
 
 def neighbour_errors(
@@ -409,7 +401,10 @@ def tables(rows: Rows) -> dict[str, Table]:
     return {"short": short} | {
         name: Table(
             (f"{name} ({unit})", *heads),
-            tuple((method, *(cell(groups[g], place, form) for g in GROUPS)) for method, groups in rows.items()),
+            tuple(
+                (method, *(cell(groups[g], place, form) if g in groups else "-" for g in GROUPS))
+                for method, groups in rows.items()
+            ),
         )
         for place, (name, unit, form) in enumerate(units)
     }
@@ -501,10 +496,12 @@ def main() -> None:
     residuals: dict[str, list[tuple[Residual, Any]]] = {
         "published model": [(PublishedAerodynamics(robot.control_timestep), jnp.zeros(0))],
     }
+    learned: dict[str, list[TrainedResidual]] = {}
     for name in methods:
         own = seeds[:1] if METHODS[name].kind == "fluid" else seeds
-        learned = [learn(name, files, options.output, seed, quick=options.quick) for seed in own]
-        residuals[name] = [(each.model, each.params) for each in learned]
+        learned[name] = [learn(name, files, options.output, seed, quick=options.quick) for seed in own]
+        residuals[name] = [(each.model, each.params) for each in learned[name]]
+    (fluid,) = learned["fluid"]
     evaluators = Evaluators(simulator)
     drawn = {name: residuals[name][0] for name in ("published model", "fluid")}
     residuals["constant wrench"] = [fit_constant_wrench(simulator, training)]
@@ -527,9 +524,10 @@ def main() -> None:
         if name in MEANS:
             turns = {group: mean_yaw_errors(evaluator, replays[name][0], places[group]) for group in TEST}
             means[name] = {f"{group}, {thrusts}": turn for group in TEST for thrusts, turn in turns[group].items()}
-    trimmed, moments = trimmed_errors(evaluators, residuals["fluid"][0], flown, places)
-    print(f"yaw moments of the halves of each group (N m): {moments}", flush=True)
-    rows[TRIMMED] = {group: [found] for group, found in trimmed.items()}
+    if not options.quick:
+        own = {group: places[group] for group in TEST}
+        trimmed = trimmed_errors(simulator, fluid, evaluators.of(fluid.model, flown), own)
+        rows[TRIMMED] = {group: [found] for group, found in trimmed.items()}
     rows["nearest moments"] = {
         group: [neighbour_errors(training, flown, robot.control_timestep)] for group, flown in groups.items()
     }
