@@ -72,6 +72,8 @@ METHODS: Mapping[str, Mapping[str, Method]] = {
     "identified": {"identified, then EnvMimic": Method("envmimic")},
 }
 """Methods by row of the tables, by values of the model's parameters."""
+QUICK_ROWS = ("supervised", "analytic", "EnvMimic")
+"""Rows of a trial run."""
 
 Motions = Mapping[str, Sequence[Motion]]
 """Reconstructed recordings by use."""
@@ -184,6 +186,8 @@ def main() -> None:
         rows[name] = [errors_of(evaluators, *nothing, motions)]
         learned: dict[str, list[TrainedResidual]] = {}
         for row, method in METHODS[name].items():
+            if quick and row not in QUICK_ROWS:
+                continue
             print(f"{row}:", flush=True)
             uses = motions["training"], motions["validation"]
             starts = [None] * len(seeds) if method.start is None else learned[method.start]
