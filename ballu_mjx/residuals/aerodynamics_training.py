@@ -20,8 +20,7 @@ from ballu_mjx.residuals.aerodynamics import (
 )
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, AirFit, check_air_config, identify_air, most_evaluations
 from ballu_mjx.residuals.trained_residual import TrainedResidual
-from ballu_mjx.residuals.white_box_training import FitReport, fitted_residual
-from ballu_mjx.robots.model import same_parameters
+from ballu_mjx.residuals.white_box_training import FitReport, check_earlier, fitted_residual
 from ballu_mjx.runs.progress import PhaseProgress
 from ballu_mjx.runs.record import MemoryRecord, TrainingRecord
 from ballu_mjx.sim.simulator import Simulator
@@ -62,14 +61,8 @@ def fit_aerodynamics(
     if not free:
         unknown = [name for name in AIR_PARAMETERS if name not in known]
         raise InputError(f"--free names no parameter that is unknown; give one or more of {', '.join(unknown)}.")
-    if fixed_from is not None and not same_parameters(fixed_from.actuators, simulator.actuators):
-        raise InputError(
-            "The earlier residual was fitted with other actuators than the simulator's; give the same actuators."
-        )
-    if fixed_from is not None and not isinstance(fixed_from.model, Aerodynamics):
-        raise InputError(
-            f"The earlier residual is of the kind {fixed_from.model.name}, not aerodynamic; give an aerodynamic one."
-        )
+    if fixed_from is not None:
+        check_earlier(fixed_from, simulator, Aerodynamics, "aerodynamic")
     record = MemoryRecord({"fit": dataclasses.asdict(config)}) if run is None else run
     report, most = FitReport(record, progress, "cost"), most_evaluations(config, free)
     values = None if fixed_from is None else fixed_from.params

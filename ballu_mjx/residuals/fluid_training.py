@@ -8,13 +8,11 @@ from collections.abc import Sequence
 import jax
 import numpy as np
 
-from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.residuals.fluid import FLUID_FILE, FluidEstimate, FluidResidual
 from ballu_mjx.residuals.fluid_fit import FluidConfig, FluidFit, fit_fluid_forces
 from ballu_mjx.residuals.trained_residual import TrainedResidual
-from ballu_mjx.residuals.white_box_training import FitReport, fitted_residual
-from ballu_mjx.robots.model import same_parameters
+from ballu_mjx.residuals.white_box_training import FitReport, check_earlier, fitted_residual
 from ballu_mjx.runs.progress import PhaseProgress
 from ballu_mjx.runs.record import MemoryRecord, TrainingRecord
 from ballu_mjx.sim.simulator import Simulator
@@ -61,12 +59,8 @@ def fit_fluid(
 
 def _known(fixed_from: TrainedResidual, simulator: Simulator) -> FluidEstimate:
     """Return the parameters of an earlier result, without standard errors."""
-    if not isinstance(fixed_from.model, FluidResidual):
-        raise InputError(f"The earlier residual is of the kind {fixed_from.model.name}, not fluid; give a fluid one.")
-    if not same_parameters(fixed_from.actuators, simulator.actuators):
-        raise InputError(
-            "The earlier residual was fitted with other actuators than the simulator's; give the same actuators."
-        )
+    check_earlier(fixed_from, simulator, FluidResidual, "fluid")
+    assert isinstance(fixed_from.model, FluidResidual)
     values = jax.tree.map(lambda x: np.asarray(x, np.float64), fixed_from.params)
     return FluidEstimate(fixed_from.model.term_set, values, jax.tree.map(np.zeros_like, values))
 

@@ -8,16 +8,34 @@ from typing import Any
 
 import numpy as np
 
+from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import stack_motions
 from ballu_mjx.residuals.network_config import ForceNetworkConfig
 from ballu_mjx.residuals.network_input import recorded_inputs
 from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.residuals.training_range import TrainingRange
+from ballu_mjx.robots.model import same_parameters
 from ballu_mjx.runs.progress import PhaseProgress
 from ballu_mjx.runs.record import TrainingRecord
 from ballu_mjx.sim.residual import Residual
 from ballu_mjx.sim.simulator import Simulator
+
+
+def check_earlier(earlier: TrainedResidual, simulator: Simulator, kind: type, name: str) -> None:
+    """Check that parameters of an earlier result can be kept in a fit with `simulator`.
+
+    **Raises** `InputError` if it was fitted with other actuators, or if its residual is not of `kind`, called `name`.
+    """
+    if not same_parameters(earlier.actuators, simulator.actuators):
+        raise InputError(
+            "The earlier residual was fitted with other actuators than the simulator's; give the same actuators."
+        )
+    if not isinstance(earlier.model, kind):
+        article = "an" if name[0] in "aeiou" else "a"
+        raise InputError(
+            f"The earlier residual is of the kind {earlier.model.name}, not {name}; give {article} {name} one."
+        )
 
 
 class FitReport:

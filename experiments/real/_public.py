@@ -17,6 +17,7 @@ from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.csv_format import write_recording
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.robots.description import RobotDescription
+from ballu_mjx.sim.c_model import site_poses
 
 
 def recordings_of(
@@ -92,19 +93,9 @@ def read_columns(path: Path, wanted: Sequence[str]) -> dict[str, Float[np.ndarra
 
 def with_kinematics(recording: Recording, robot: RobotDescription, model: mujoco.MjModel) -> Recording:
     """Return a recording of joint angles with the poses of the description's sites, by forward kinematics."""
-    data = mujoco.MjData(model)
-    names = robot.tracked, *robot.points
-    positions, turns = {name: [] for name in names}, []
-    for number in range(len(recording.time)):
-        for joint, angles in recording.joint_angles.items():
-            data.joint(joint).qpos[:] = angles[number]
-        mujoco.mj_kinematics(model, data)
-        for name in names:
-            positions[name].append(data.site(name).xpos.copy())
-        turns.append(data.body(model.site_bodyid[model.site(robot.tracked).id]).xquat.copy())
-    return dataclasses.replace(
-        recording,
-        tracked_position=np.array(positions[robot.tracked]),
-        tracked_quaternion=np.array(turns),
-        points={name: np.array(positions[name]) for name in robot.points},
-    )
+    qpos = np.tile(model.qpos0, (len(recording.time), 1))
+    for joint, angles in recording.joint_angles.items():
+        qpos[:, model.joint(joint).qposadr[0]] = angles
+    position, quaternion = site_poses(model, robot.tracked, qpos)
+    points = {name: site_poses(model, name, qpos)[0] for name in robot.points}
+    return dataclasses.replace(recording, tracked_position=position, tracked_quaternion=quaternion, points=points)

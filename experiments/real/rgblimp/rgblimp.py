@@ -105,7 +105,7 @@ class Method(NamedTuple):
     @property
     def folder(self) -> str:
         """Name of the method's runs."""
-        return "-".join((*self.command, *(self.earlier or ()))).replace("--", "").replace(" ", "-")
+        return "-".join((*self.command, *(self.earlier or ()))).replace("--", "")
 
 
 _FADING = ("--fade-width", "1")
@@ -167,22 +167,14 @@ def convert(path: Path, name: str) -> Recording:
     )
 
 
-SOURCES = {number: f"data_{number}.csv" for numbers in (TRAINING, *GROUPS.values()) for number in numbers}
-"""Public files by number."""
-
-
 def find(data: Path, numbers: Sequence[int], robot: RobotDescription, made: Path) -> list[Path]:
     """Return recordings of flights, given the numbers of their files. Recordings are written to `made`.
 
     **Raises** `InputError` from `_public.recordings_of`.
     """
-    sources = {_name(number): SOURCES[number] for number in numbers}
+    sources = {f"flight-{number:03d}": f"data_{number}.csv" for number in numbers}
     folder = _public.recordings_of(data, made, sources, convert, robot)
     return [folder / f"{name}.csv.gz" for name in sources]
-
-
-def _name(number: int) -> str:
-    return f"flight-{number:03d}"
 
 
 def load(paths: Sequence[Path], robot: RobotDescription) -> list[Motion]:
