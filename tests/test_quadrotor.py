@@ -236,7 +236,7 @@ def test_a_file_that_ends_after_its_header_is_refused(experiment: ModuleType, tm
 
 
 def test_a_missing_flight_is_named(experiment: ModuleType, robot: RobotDescription, tmp_path: Path):
-    with pytest.raises(InputError, match=r"has no file custom_figure8_baseline_nowind\.csv"):
+    with pytest.raises(InputError, match=r"neither nowind-baseline\.csv\.gz nor custom_figure8_baseline_nowind\.csv"):
         experiment.load(tmp_path, experiment.FLIGHTS["training"], robot, tmp_path / "made")
 
 

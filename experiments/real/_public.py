@@ -26,6 +26,8 @@ def recordings_of(
     sources: Mapping[str, str],
     convert: Callable[[Path, str], Recording],
     robot: RobotDescription,
+    *,
+    decimals: int = 5,
 ) -> Path:
     """Return the folder that holds `NAME.csv.gz` of all recordings: `data`, or else `made`.
 
@@ -36,6 +38,7 @@ def recordings_of(
     - `sources`: path of the public file in `data`, by name of the recording. A name may have folders. A file may be
       compressed (`.xz`).
     - `convert`: function of the public file and the recording's name that returns the recording.
+    - `decimals`: see `write_recording`.
 
     **Raises** `InputError` if `data` lacks a public file, and from `convert`.
     """
@@ -52,7 +55,7 @@ def recordings_of(
                 "recordings made of it."
             )
         target.parent.mkdir(parents=True, exist_ok=True)
-        write_recording(convert(path, Path(name).name), target, robot)
+        write_recording(convert(path, Path(name).name), target, robot, decimals=decimals)
     return made
 
 
@@ -61,16 +64,24 @@ def public_file(data: Path, source: str) -> Path | None:
     return next((path for path in (data / source, data / f"{source}.xz") if path.is_file()), None)
 
 
-def read_columns(path: Path, wanted: Sequence[str]) -> dict[str, Float[np.ndarray, " rows"]]:
-    """Return columns of a table with commas and a header. The file may be compressed (`.xz` or `.gz`).
+def read_text(path: Path) -> str:
+    """Return the text of a public file, which may be compressed (`.xz` or `.gz`).
 
-    **Raises** `InputError` if a column is missing, or if a cell of a wanted column is not a finite number.
+    **Raises** `InputError` if the file is not whole.
     """
     try:
-        text = lzma.open(path, "rt").read() if path.suffix == ".xz" else files.read_text(path)
+        return lzma.open(path, "rt").read() if path.suffix == ".xz" else files.read_text(path)
     except (EOFError, lzma.LZMAError) as error:
         raise InputError(f"{path}: not a whole .xz file; download the file again.") from error
-    header, _, body = text.partition("\n")
+
+
+def read_columns(path: Path, wanted: Sequence[str]) -> dict[str, Float[np.ndarray, " rows"]]:
+    """Return columns of a table with commas and a header.
+
+    **Raises** `InputError` if a column is missing, if a cell of a wanted column is not a finite number, and from
+    `read_text`.
+    """
+    header, _, body = read_text(path).partition("\n")
     columns = [column.strip() for column in header.split(",")]
     for column in wanted:
         if column not in columns:

@@ -52,17 +52,17 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
+import _public
 import numpy as np
 from _constant_wrench import ConstantWrench
 from _networks import learn_network
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.common.results import Table
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator, Replay
-from ballu_mjx.recordings.csv_format import read_recording, write_recording
+from ballu_mjx.recordings.csv_format import read_recording
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.recordings.recording import Recording
@@ -170,7 +170,7 @@ def read_columns(path: Path) -> dict[str, Float[np.ndarray, "rows _"]]:
 
     **Raises** `InputError` with the place in the file, as `convert` does.
     """
-    reader = csv.reader(io.StringIO(files.read_text(path), newline=""))
+    reader = csv.reader(io.StringIO(_public.read_text(path), newline=""))
     header = next(reader, [])
     missing = [column for column in WIDTHS if column not in header]
     if missing:
@@ -202,19 +202,13 @@ def parse_cell(cell: str) -> Float[np.ndarray, ...]:
 
 
 def load(data: Path, chosen: Sequence[Flight], robot: RobotDescription, made: Path) -> list[Motion]:
-    """Convert flights to recordings in the folder `made`, and return the reconstructed motions.
+    """Return the reconstructed motions of flights. Recordings are written to `made` if `data` has public files.
 
-    **Raises** `InputError` if `data` lacks a file, and if a file is not as expected.
+    **Raises** `InputError` from `_public.recordings_of` and `convert`.
     """
-    made.mkdir(parents=True, exist_ok=True)
-    motions = []
-    for flight in chosen:
-        source, path = data / flight.file, made / f"{flight.name}.csv.gz"
-        if not source.is_file():
-            raise InputError(f"{data}: has no file {flight.file}; download the public data set, and give its folder.")
-        write_recording(convert(source, flight.name), path, robot, decimals=DECIMALS)
-        motions.append(reconstruct(read_recording(path, robot), robot))
-    return motions
+    sources = {flight.name: flight.file for flight in chosen}
+    folder = _public.recordings_of(data, made, sources, convert, robot, decimals=DECIMALS)
+    return [reconstruct(read_recording(folder / f"{name}.csv.gz", robot), robot) for name in sources]
 
 
 # %% [markdown]
@@ -335,7 +329,7 @@ def tables(rows: Mapping[str, Ends]) -> dict[str, Table]:
 # %%
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description="Learn the forces of wind on a real quadrotor, and predict flights.")
-    parser.add_argument("--data", type=Path, required=True, help="folder with the public files")
+    parser.add_argument("--data", type=Path, required=True, help="folder with the public files, or with recordings")
     parser.add_argument("--methods", nargs="*", choices=METHODS, default=list(METHODS), help="methods (all)")
     parser.add_argument("--seed", type=int, default=0, help="training seed (0)")
     parser.add_argument("--quick", action="store_true", help="few flights and steps; the numbers mean little")
