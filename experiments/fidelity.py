@@ -10,10 +10,10 @@
 # - regression on the forces that explain the recordings (supervised): with full forces, as in the paper, and with the
 #   scale of the forces that helps most;
 # - forces by gradients through the simulation (analytic);
-# - the air's parameters (aerodynamic): all of them, or all but the lift;
+# - the air's parameters (aerodynamic): all of them, all but the lift, or all but the friction of contacts;
 # - networks in addition to the air (aerodynamic+analytic, aerodynamic+EnvMimic);
 # - for comparison, the command delay without air (unless the identified actuators have a delay), and the air without
-#   delay and centre.
+#   delay, centre and friction.
 #
 # Each method is trained once for each seed. Finished runs are not repeated. Test recordings have gaits, other commands,
 # and, as in the paper, the actions of a walking policy that was trained in vanilla.
@@ -107,15 +107,18 @@ METHODS = {
     "analytic-wrench": Method("analytic, wrench", ("analytic", "--forces", "wrench")),
     AIR: Method("aerodynamic", (AIR,), seeded=False),
     "air-lift": Method("aerodynamic, the model's lift", _air_without("lift"), seeded=False),
+    "air-friction": Method("aerodynamic, the model's friction", _air_without("friction"), seeded=False),
     "air-analytic": Method("aerodynamic+analytic", ("analytic",), beside=AIR),
     "air-envmimic": Method("aerodynamic+EnvMimic", ("envmimic",), beside=AIR),
     "delay": Method("vanilla+sysid+delay", DELAY, seeded=False),
     "delay-envmimic": Method("vanilla+sysid+delay+EnvMimic", ("envmimic",), beside="delay"),
-    "air-alone": Method("aerodynamic, no delay or centre", _air_without("delay", "centre"), seeded=False),
+    "air-alone": Method(
+        "aerodynamic, no delay, centre or friction", _air_without("delay", "centre", "friction"), seeded=False
+    ),
 }
-"""Methods by key. The last three isolate the command delay and the balloons' centre, which only the aerodynamic
-residual has. The delay is identified from the same recordings, for simulators without air. `air-alone` is the air
-without both."""
+"""Methods by key. The last three isolate the command delay, the balloons' centre and the friction, which only the
+aerodynamic residual has. The delay is identified from the same recordings, for simulators without air. `air-alone` is
+the air without these three."""
 
 
 def train(folder: Path, *arguments: str, result: str = "evaluation.json") -> None:

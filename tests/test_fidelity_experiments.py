@@ -36,6 +36,7 @@ SCRIPTS = {
     "deflation.py": "deflation",
     "fidelity.py": "fidelity",
     "fidelity_limits.py": "fidelity-limits",
+    "foot_friction.py": "foot-friction",
     "real/compass_gait/compass_gait.py": "compass_gait",
     "real/double_pendulum/double_pendulum.py": "double_pendulum",
     "real/double_pendulum/residuals.py": "double_pendulum_residuals",

@@ -8,12 +8,12 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from ballu_mjx.common.rotations import quaternion_product
 from ballu_mjx.policies.locomotion_config import LocomotionConfig
 from ballu_mjx.robots.description import RobotDescription
-from ballu_mjx.robots.model import ModelParameters, bare_parameters
+from ballu_mjx.robots.model import ModelParameters, bare_parameters, colliding_geoms
 from ballu_mjx.sim.drivetrain import DrivetrainParameters, drivetrain_of
 
 
@@ -44,11 +44,6 @@ class SimulatorSetting(NamedTuple):
     spread: StartSpread
     push: Float[Array, " 6"]
     """Standard deviation of the constant force (N) and torque (N m) on the tracked body, world frame."""
-
-
-def colliding_geoms(model: mujoco.MjModel) -> Int[np.ndarray, " colliding"]:
-    """Return the ids of the geoms that may touch others, including those of the world."""
-    return np.flatnonzero((model.geom_contype != 0) | (model.geom_conaffinity != 0))
 
 
 def make_simulator_setting(

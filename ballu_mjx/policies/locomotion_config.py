@@ -19,7 +19,8 @@ class LocomotionConfig:
     the options of start and pushes have no effect. Masses and buoyancy are not drawn, because they change gaits too
     much."""
     friction: tuple[float, float] = (0.5, 1.1)
-    """Range of the coefficient of sliding friction. One value is drawn for all geoms that collide."""
+    """Range of the coefficient of sliding friction. One value is drawn for all geoms that collide. A residual that
+    changes the friction (aerodynamic) changes the range by the same factor."""
     start_yaw: float = 20.0
     """Largest starting heading, deg. It is drawn between minus and plus this angle."""
     start_tilt: float = 2.0

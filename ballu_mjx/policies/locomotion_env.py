@@ -20,7 +20,6 @@ from jaxtyping import Array, Float, Int
 from ballu_mjx.policies.domain_randomization import (
     SimulatorSetting,
     Start,
-    colliding_geoms,
     draw_start,
     make_simulator_setting,
 )
@@ -31,7 +30,7 @@ from ballu_mjx.policies.tasks.base import mean_velocity
 from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.rl.training_env import initial_state
 from ballu_mjx.robots.description import RobotDescription
-from ballu_mjx.robots.model import ModelParameters
+from ballu_mjx.robots.model import ModelParameters, colliding_geoms
 from ballu_mjx.sim.observation import HISTORY, ObservationLayout, heading_observation
 from ballu_mjx.sim.residual import Action
 from ballu_mjx.sim.simulator import RolloutState, Simulator
@@ -122,9 +121,13 @@ class LocomotionEnv(Env):
         # The residual's fields contain the identified values already, for example the mass without the dragged fluid.
         changed = {} if residual is None else residual.bound.fields
         fields = {name: value for name, value in setting.fields.items() if name not in changed}
-        self.setting = setting._replace(fields=fields)
         self._colliding = colliding_geoms(model)
-        self._friction = jnp.asarray(model.geom_friction)
+        friction = setting.friction
+        if "geom_friction" in changed:  # The residual's friction scales the model's, and so the range of the draws.
+            own = model.geom_friction[self._colliding, 0]
+            ratio = changed["geom_friction"][self._colliding, 0] / np.where(own > 0, own, 1.0)
+            friction = friction * ratio[:, None]
+        self.setting = setting._replace(fields=fields, friction=friction)
         self._rest = jnp.asarray(robot.adapter.rest_command(robot, model), jnp.float32)
 
     @property
@@ -136,6 +139,11 @@ class LocomotionEnv(Env):
         """
         residual = None if self.residual is None else (self.residual.params, self.residual.observed)
         return EnvironmentParameters(self.simulator.simulator.model, self.setting, residual)
+
+    @property
+    def _model_friction(self) -> Float[Array, "geoms 3"]:
+        """Friction of all geoms, with the residual's model fields."""
+        return self.simulator.simulator.model.geom_friction
 
     def with_parameters(self, parameters: EnvironmentParameters) -> LocomotionEnv:
         """Return the same environment with other parameters, which may be traced."""
@@ -158,8 +166,9 @@ class LocomotionEnv(Env):
         return self._start(locomotion_state(state).setting, rng)
 
     def at(self, qpos: Float[Array, " nq"], qvel: Float[Array, " nv"], rng: Array) -> State:
-        """Start from a given state, with nominal friction and no push. The episode has no time limit."""
-        state = self._begin(self.setting, Start(qpos, qvel, self._friction[self._colliding, 0], jnp.zeros(6), rng))
+        """Start from a given state, with the model's friction and no push. The episode has no time limit."""
+        friction = self._model_friction[self._colliding, 0]
+        state = self._begin(self.setting, Start(qpos, qvel, friction, jnp.zeros(6), rng))
         endless = locomotion_state(state)._replace(remaining=jnp.asarray(2**30, jnp.int32))
         return dataclasses.replace(state, pipeline_state=cast(Any, endless))
 
@@ -170,7 +179,7 @@ class LocomotionEnv(Env):
         key, key_force = jax.random.split(before.key)
         excess = self._excess(before.rollout, command)
 
-        friction = {"geom_friction": self._friction.at[self._colliding, 0].set(before.friction)}
+        friction = {"geom_friction": self._model_friction.at[self._colliding, 0].set(before.friction)}
         drawn = key_force if self.config.sampled_residual else None
         simulator = self.simulator.with_fields(before.setting.fields | friction)
         simulator = simulator.with_drivetrain(before.setting.drivetrain)

@@ -1,4 +1,4 @@
-"""Aerodynamic residual: a physical model of the air around a buoyant body, with sixteen parameters.
+"""Aerodynamic residual: a physical model of the air around a buoyant body, with seventeen parameters.
 
 The body is the tracked body of the robot and has `gravcomp` in its model. It drags along half of the air that it
 displaces (added mass), and drag slows it. The lift may act at another point than in the model. Each effect is a
@@ -57,20 +57,28 @@ class AirParameters:
     delay: Float[Array, ""]
     """Delay between commands and actuators (s), at most `longest_delay`. It is no effect of the air. But a late motion
     looks like that of a heavier body, so a fit without the delay would overestimate the added mass."""
+    friction: Float[Array, ""]
+    """Sliding friction of all contacts in addition to the model's, as a share of the model's (1). It is no effect of
+    the air. But drag and sliding feet both slow a walking robot, so a fit without it would put errors of the friction
+    into the drag."""
 
     @staticmethod
     def none() -> AirParameters:
         """Return the parameters of the nominal model: all are 0."""
         zero = jnp.zeros(())
         three = jnp.zeros(3)
-        return AirParameters(zero, zero, zero, three, three, three, three, zero)
+        return AirParameters(zero, zero, zero, three, three, three, three, zero, zero)
 
 
-AERODYNAMICS_FORMAT = "ballu-air/1"
+AERODYNAMICS_FORMAT = "ballu-air/2"
+_READ = ("ballu-air/1", AERODYNAMICS_FORMAT)
+"""Formats that can be read. Files of the first one have no friction, which is then 0."""
 AERODYNAMICS_FILE = "air.json"
 AIR_PARAMETERS = tuple(field.name for field in dataclasses.fields(AirParameters))
-SIGNED_AIR_PARAMETERS = ("lift", "centre")
+SIGNED_AIR_PARAMETERS = ("lift", "centre", "friction")
 """Parameters that may be negative."""
+LEAST_FRICTION = -0.95
+"""Smallest friction parameter. Contacts keep a twentieth of the model's friction."""
 _LARGEST = 100.0
 """Largest magnitude of a parameter other than the delay (SI units), far above all realistic values."""
 _SINGLE_PRECISION = 1e-6
@@ -101,6 +109,7 @@ class Aerodynamics(Residual):
         self._centre = jnp.asarray(model.body_ipos)
         self._timestep, self._substeps = float(model.opt.timestep), count_substeps(model, robot.control_timestep)
         self._gravity = float(np.linalg.norm(model.opt.gravity))
+        self._friction = jnp.asarray(model.geom_friction)
 
     @property
     def name(self) -> str:
@@ -112,13 +121,18 @@ class Aerodynamics(Residual):
         return network_input(history, commands, ForceNetworkConfig(), self._robot)
 
     def fields(self, params: AirParameters) -> Fields:
-        """Return model fields with the tracked body's mass, inertia, centre of mass and lift.
+        """Return model fields with the tracked body's mass, inertia, centre of mass and lift, and with the friction.
 
         The lift compensates the weight of the added mass.
         """
         centre = self._centre.at[self._body.id].add(params.centre)
+        friction = self._friction.at[:, 0].multiply(1 + params.friction)
         lifted = params.lift / self._gravity
-        return {"body_ipos": centre, **self._body.fields(params.added_mass, params.added_inertia, lifted)}
+        return {
+            "body_ipos": centre,
+            "geom_friction": friction,
+            **self._body.fields(params.added_mass, params.added_inertia, lifted),
+        }
 
     def command(self, params: AirParameters, commands: Commands) -> Float[Array, "parts commands"]:
         """Return the command that has arrived at the start of each physics step, after the delay.
@@ -145,14 +159,17 @@ physics steps could arrive one physics step late."""
 
 
 def read_air_parameters(path: Path, robot: RobotDescription) -> AirParameters:
-    """Read parameters from a file of the format `ballu-air/1`, which `train aerodynamic` writes.
+    """Read parameters from a file that `train aerodynamic` writes (`AERODYNAMICS_FILE`).
 
     **Raises** `InputError` if the file is damaged. The message names file, parameter and fix.
     """
     content = files.read_json(path, "restore it or identify again")
-    if content.get("format") != AERODYNAMICS_FORMAT or not isinstance(content.get("parameters"), dict):
+    written, parameters = content.get("format"), content.get("parameters")
+    if written not in _READ or not isinstance(parameters, dict):
         raise InputError(f'{path}: is not of the format "{AERODYNAMICS_FORMAT}"; give one that this program wrote.')
-    return air_parameters_from_json(content["parameters"], path, robot)
+    if written != AERODYNAMICS_FORMAT:
+        parameters = {"friction": 0.0, **parameters}
+    return air_parameters_from_json(parameters, path, robot)
 
 
 def air_parameters_to_json(params: AirParameters) -> dict[str, Any]:
@@ -184,6 +201,8 @@ def air_parameters_from_json(values: Mapping[str, Any], path: Path, robot: Robot
             raise InputError(f"{path}: {name} must be {needed}, not {reprlib.repr(value)}.")
         if name not in SIGNED_AIR_PARAMETERS and min(numbers) < 0:
             raise InputError(f"{path}: {name} is {value}; it must be 0 or more.")
+        if name == "friction" and min(numbers) < LEAST_FRICTION * (1 + _SINGLE_PRECISION):
+            raise InputError(f"{path}: friction is {value}; it must be {LEAST_FRICTION} or more.")
         largest = longest_delay(robot) if name == "delay" else _LARGEST
         if max(map(abs, numbers)) > largest * (1 + _SINGLE_PRECISION):
             raise InputError(f"{path}: {name} is {value}; its magnitude must be {largest:g} or less.")

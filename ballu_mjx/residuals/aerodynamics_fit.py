@@ -34,6 +34,7 @@ from ballu_mjx.recordings.motion_windows import (
 from ballu_mjx.recordings.window_errors import OUTLIER_THRESHOLD, fill_diverged, pseudo_huber
 from ballu_mjx.residuals.aerodynamics import (
     AIR_PARAMETERS,
+    LEAST_FRICTION,
     SIGNED_AIR_PARAMETERS,
     Aerodynamics,
     AirParameters,
@@ -81,6 +82,7 @@ def air_scales(robot: RobotDescription, model: mujoco.MjModel) -> dict[str, Scal
     - Quadratic drag: that of a sphere with drag coefficient 0.47. Linear drag: its slope at a speed of 0.25 m/s.
     - Rotary drag: the linear drag times r^2.
     - Delay: a control step.
+    - Friction: a fifth of the model's.
     """
     body = int(model.site_bodyid[model.site(robot.tracked).id])
     displaced = float(model.body_mass[body] * model.body_gravcomp[body])
@@ -96,13 +98,19 @@ def air_scales(robot: RobotDescription, model: mujoco.MjModel) -> dict[str, Scal
         "quadratic_drag": Scale(drag),
         "turning_drag": Scale(_SLOW * drag * radius**2),
         "delay": Scale(robot.control_timestep),
+        "friction": Scale(0.2),
     }
 
 
 _AIR_DENSITY, _SPHERE_DRAG, _SLOW = 1.2, 0.47, 0.25
 """Density of air (kg/m^3), drag coefficient of a sphere, and a speed (m/s) at which drag is linearized."""
-_DELAY_EVALUATIONS = 4
-"""Largest number of evaluations of the solver at each of the two whole delays next to the fitted delay."""
+_FEW_EVALUATIONS = 4
+"""Largest number of evaluations of the solver at each friction, and at each of the two whole delays next to the fitted
+delay."""
+_FRICTION_STEPS = (0.2, 0.1)
+"""Steps in which the search moves the friction."""
+_FRICTIONS_TRIED = 8
+"""Largest number of frictions that are tried."""
 _MARGIN = 0.01
 """Distance of a starting value from its bounds, in multiples of `typical`. A solver that starts on a bound wastes its
 first steps."""
@@ -171,8 +179,9 @@ def identify_air(
     owner = np.repeat(AIR_PARAMETERS, [getattr(none, name).size for name in AIR_PARAMETERS])
     scales = air_scales(simulator.robot, simulator.mj_model)
     scale, prior = np.array([scales[name] for name in owner]).T
-    is_delay = owner == "delay"
+    is_delay, is_friction = owner == "delay", owner == "friction"
     low = np.where(np.isin(owner, SIGNED_AIR_PARAMETERS), -np.inf, 0.0)
+    low[is_friction] = LEAST_FRICTION
     high = np.where(is_delay, simulated.longest_delay, np.inf)
     evaluations = 0
 
@@ -219,13 +228,18 @@ def identify_air(
     places = np.flatnonzero(np.isin(owner, list(free)))
     if fixed_from is None:  # Parameters that cannot be negative do not start at their bound 0.
         start[places] = np.where(np.isin(owner, SIGNED_AIR_PARAMETERS), 0.0, scale)[places]
-    found = fitted(start, places, config.evaluations)
+    others = places[~is_friction[places]]
+    found = fitted(start, others, config.evaluations)
+    if "friction" in free:
+        found = along_friction(found, is_friction, lambda vector: fitted(vector, others, _FEW_EVALUATIONS))
+        covariance = fitted(found.vector, places, 1).covariance
+        found = found._replace(covariance=with_rounding(covariance, is_friction, _FRICTION_STEPS[-1]))
     if "delay" in free:
         found = at_whole_delay(
             found,
             is_delay,
             simulated.timestep,
-            lambda vector: fitted(vector, places[~is_delay[places]], _DELAY_EVALUATIONS),
+            lambda vector: fitted(vector, others[~is_delay[others]], _FEW_EVALUATIONS),
         )
     return AirFit(
         parameters=unravel(jnp.asarray(found.vector, jnp.float32)),
@@ -239,10 +253,12 @@ def identify_air(
 def most_evaluations(config: AirConfig, free: Sequence[str]) -> int:
     """Return the largest number of evaluations of `identify_air`."""
     none = AirParameters.none()
-    sizes = {name: getattr(none, name).size for name in free}
-    found = 1 + _limit(config.evaluations, sum(sizes.values()))
-    if "delay" in sizes:
-        found += 2 * _limit(_DELAY_EVALUATIONS, sum(sizes.values()) - sizes["delay"])
+    others = sum(getattr(none, name).size for name in free if name != "friction")
+    found = 1 + _limit(config.evaluations, others)
+    if "friction" in free:
+        found += _FRICTIONS_TRIED * _limit(_FEW_EVALUATIONS, others) + 1
+    if "delay" in free:
+        found += 2 * _limit(_FEW_EVALUATIONS, others - 1)
     return found
 
 
@@ -261,13 +277,45 @@ class Optimum(NamedTuple):
     cost: float
 
 
+def along_friction(
+    found: Optimum, friction: Bool[np.ndarray, " parameters"], fitted: Callable[[np.ndarray], Optimum]
+) -> Optimum:
+    """Move the friction in steps, fit the other parameters again at each, and return the optimum of lowest cost.
+
+    Feet stick or slide. The cost has kinks along the friction, at which the solver stops if it fits the friction
+    together with the other parameters (`docs/white_box.md`, "Friction of the feet").
+
+    **Arguments**
+
+    - `found`: optimum at the starting value of the friction.
+    - `friction`: mask of the friction in the vector of parameters.
+    - `fitted`: function that fits the other parameters, from a vector with another friction.
+    """
+    tried = 0
+    for step in _FRICTION_STEPS:
+        for change in (-step, step):
+            before = found
+            while tried < _FRICTIONS_TRIED:
+                moved = np.where(friction, found.vector + change, found.vector)
+                if moved[friction][0] < LEAST_FRICTION:
+                    break
+                tried += 1
+                candidate = fitted(moved)
+                if candidate.cost >= found.cost:
+                    break
+                found = candidate
+            if found is not before:  # the other direction leads back
+                break
+    return found
+
+
 def at_whole_delay(
     found: Optimum, delay: Bool[np.ndarray, " parameters"], step: float, fitted: Callable[[np.ndarray], Optimum]
 ) -> Optimum:
     """Round the delay of an optimum to a whole number of physics steps, and fit the other parameters again.
 
     Both whole delays next to the delay of `found` are tried, and the one with the lower cost is kept. The covariance is
-    that of `found`, plus the effect of rounding on the delay and on the parameters that are correlated with it.
+    that of `found`, plus the effect of rounding (`with_rounding`).
 
     **Arguments**
 
@@ -276,13 +324,22 @@ def at_whole_delay(
     - `step`: duration of a physics step (s).
     - `fitted`: function that fits the other parameters, from a vector with a whole delay.
     """
-    place = int(np.flatnonzero(delay)[0])
-    steps = found.vector[place] / step
+    steps = float(found.vector[delay][0]) / step
     neighbours = {int(np.floor(steps + _ROUNDING)), int(np.ceil(steps - _ROUNDING))}
     best = min((fitted(np.where(delay, step * whole, found.vector)) for whole in neighbours), key=lambda fit: fit.cost)
-    # A rounding error is uniformly distributed over a physics step, so its variance is step^2 / 12.
-    regression = found.covariance[place] / max(found.covariance[place, place], np.finfo(float).tiny)
-    return best._replace(covariance=found.covariance + np.outer(regression, regression) * step**2 / 12)
+    return best._replace(covariance=with_rounding(found.covariance, delay, step))
+
+
+def with_rounding(
+    covariance: Float[np.ndarray, "parameters parameters"], rounded: Bool[np.ndarray, " parameters"], step: float
+) -> Float[np.ndarray, "parameters parameters"]:
+    """Return a covariance with the effect of rounding one parameter to steps, also on those correlated with it.
+
+    A rounding error is uniformly distributed over a step, so its variance is step^2 / 12.
+    """
+    place = int(np.flatnonzero(rounded)[0])
+    regression = covariance[place] / max(covariance[place, place], np.finfo(float).tiny)
+    return covariance + np.outer(regression, regression) * step**2 / 12
 
 
 _ROUNDING = 1e-3

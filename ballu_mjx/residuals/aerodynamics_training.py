@@ -21,6 +21,7 @@ from ballu_mjx.residuals.aerodynamics import (
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, AirFit, check_air_config, identify_air, most_evaluations
 from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.residuals.white_box_training import FitReport, check_earlier, fitted_residual
+from ballu_mjx.robots.model import colliding_geoms
 from ballu_mjx.runs.progress import PhaseProgress
 from ballu_mjx.runs.record import MemoryRecord, TrainingRecord
 from ballu_mjx.sim.simulator import Simulator
@@ -47,7 +48,7 @@ def fit_aerodynamics(
     - `config`: options of the fit. None for the defaults.
     - `fixed_from`: an earlier result. Its parameters are kept, except those in `free`. If None, they are 0.
     - `free`: names of the parameters to fit. If the simulator's drivetrain has a delay, the delay is known and is not
-      fitted.
+      fitted. Without geoms that collide, the friction has no effect and is not fitted.
     - `run`: record of metrics and files, for example a run's folder. None to keep them in memory.
     - `progress`: display that is updated after every evaluation.
 
@@ -56,7 +57,9 @@ def fit_aerodynamics(
     """
     config = config or AirConfig()
     check_air_config(config, simulator.control_timestep)
-    known = ("delay",) if has_delay(simulator) else ()
+    known = {"delay"} if has_delay(simulator) else set()
+    if not len(colliding_geoms(simulator.mj_model)):
+        known.add("friction")
     free = [name for name in free if name not in known]
     if not free:
         unknown = [name for name in AIR_PARAMETERS if name not in known]
@@ -105,6 +108,7 @@ _UNITS = {
     "quadratic_drag": "N s^2/m^2",
     "turning_drag": "N m s",
     "delay": "s",
+    "friction": "1",
 }
 
 

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Int
 from mujoco import mjx
 
 
@@ -92,6 +92,11 @@ def same_parameters(one: ModelParameters | None, other: ModelParameters | None) 
     return leaves.keys() == others.keys() and all(
         np.array_equal(np.float32(leaf), np.float32(others[path])) for path, leaf in leaves.items()
     )
+
+
+def colliding_geoms(model: mujoco.MjModel) -> Int[np.ndarray, " colliding"]:
+    """Return the ids of the geoms that may touch others, including those of the world."""
+    return np.flatnonzero((model.geom_contype != 0) | (model.geom_conaffinity != 0))
 
 
 def with_fields(model: mjx.Model, fields: dict[str, Array]) -> mjx.Model:

@@ -331,7 +331,7 @@ def description_fault(found: Any) -> str | None:
 
 def air_fault(found: Any) -> str | None:
     for name, value in dataclasses.asdict(found).items():
-        if not finite(value) or (name not in ("lift", "centre") and (np.asarray(value) < 0).any()):
+        if not finite(value) or (name not in ("lift", "centre", "friction") and (np.asarray(value) < 0).any()):
             return name
         if np.abs(np.asarray(value)).max() > (0.2 if name == "delay" else 1e3):
             return name
@@ -466,7 +466,7 @@ def formats(work: Path) -> list[Format]:
     folder, ballu = place(), read_description(assets() / "ballu.robot.json")
     path = folder / AERODYNAMICS_FILE
     values = dict.fromkeys(("centre", "linear_drag", "quadratic_drag", "turning_drag"), [0.01, 0.02, 0.03])
-    values |= {"added_mass": 0.1, "added_inertia": 0.003, "lift": -0.004, "delay": 0.05}
+    values |= {"added_mass": 0.1, "added_inertia": 0.003, "lift": -0.004, "delay": 0.05, "friction": -0.2}
     path.write_text(json.dumps({"format": AERODYNAMICS_FORMAT, "parameters": values, "windows": 3}))
     add(
         "air.json",

@@ -16,6 +16,7 @@ from ballu_mjx.policies.domain_randomization import make_simulator_setting
 from ballu_mjx.policies.locomotion_config import LocomotionConfig
 from ballu_mjx.policies.locomotion_env import LocomotionEnv, LocomotionState, locomotion_observation, locomotion_state
 from ballu_mjx.policies.tasks import TASKS, Step
+from ballu_mjx.residuals.aerodynamics import Aerodynamics, AirParameters
 from ballu_mjx.residuals.network import NetworkResidual
 from ballu_mjx.residuals.network_config import ForceNetworkConfig
 from ballu_mjx.residuals.network_loads import load_units
@@ -119,6 +120,15 @@ def test_randomization_of_friction_and_starting_state_is_off_by_default():
     assert config.start_yaw * 0.9 < yaw.max() <= config.start_yaw + 1 and yaw.min() < -config.start_yaw * 0.9
     knees = np.asarray(drawn.rollout.physics.qpos)[:, 7:][:, KNEES]
     assert (knees >= standing_qpos(MODEL)[7:][KNEES] - 1e-6).all()
+
+
+def test_friction_of_a_residual_scales_the_friction_of_episodes():
+    slippery = dataclasses.replace(AirParameters.none(), friction=jnp.asarray(-0.4))
+    residual = TrainedResidual(Aerodynamics(BALLU, MODEL), slippery, TrainingRange.unbounded(), 0, None)
+    for randomized, expected in ((False, (0.54, 0.54)), (True, (0.3, 0.66))):
+        config = LocomotionConfig(domain_randomization=randomized, friction=(0.5, 1.1))
+        env = LocomotionEnv(BALLU, TASKS["walk"], config, residual=residual)
+        np.testing.assert_allclose(env.setting.friction, np.tile(expected, (3, 1)), rtol=1e-5)  # floor and feet
 
 
 @pytest.mark.slow

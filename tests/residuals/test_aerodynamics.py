@@ -19,13 +19,22 @@ from ballu_mjx.residuals.aerodynamics import (
     AERODYNAMICS_FILE,
     AERODYNAMICS_FORMAT,
     AIR_PARAMETERS,
+    LEAST_FRICTION,
     Aerodynamics,
     AirParameters,
     air_parameters_to_json,
     longest_delay,
     read_air_parameters,
 )
-from ballu_mjx.residuals.aerodynamics_fit import AirConfig, AirFit, Optimum, air_scales, at_whole_delay, identify_air
+from ballu_mjx.residuals.aerodynamics_fit import (
+    AirConfig,
+    AirFit,
+    Optimum,
+    air_scales,
+    along_friction,
+    at_whole_delay,
+    identify_air,
+)
 from ballu_mjx.robots.model import set_fields
 from ballu_mjx.robots.registry import load_robot
 from ballu_mjx.sim.observation import HISTORY, euler_to_matrix, heading_rotation
@@ -44,6 +53,7 @@ AIR = AirParameters(
     quadratic_drag=jnp.array([0.25, 0.15, 0.2]),
     turning_drag=jnp.array([2e-3, 3e-3, 4e-3]),
     delay=jnp.array(0.05),
+    friction=jnp.array(-0.3),
 )
 CONFIG = AirConfig(window_seconds=0.5, interval_seconds=0.5)
 """In windows this short, contacts hardly amplify errors."""
@@ -51,13 +61,14 @@ COMMANDS = jnp.zeros((HISTORY, 2))
 
 
 def windy_model() -> mujoco.MjModel:
-    """Return C MuJoCo's model of the robot with the mass, inertia, centre and lift of `AIR`, from their definitions."""
+    """Return C MuJoCo's model of the robot with mass, inertia, centre, lift and friction of `AIR`, from definitions."""
     model = load_model()
     body = model.body("balloon").id
     lift = model.body_gravcomp[body] * model.body_mass[body] * 9.81 - 0.12 + 0.12 * 9.81
     model.body_mass[body] += 0.12
     model.body_inertia[body] += 3e-3
     model.body_ipos[body] += [0.004, 0.013, 0.0]
+    model.geom_friction[:, 0] *= 0.7
     model.body_gravcomp[body] = lift / (model.body_mass[body] * 9.81)
     mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
@@ -122,7 +133,7 @@ def test_parameters_without_air_leave_the_nominal_model():
 def test_added_mass_has_no_weight_and_lift_is_a_vertical_force():
     model = load_model()
     set_fields(model, Aerodynamics(load_robot(), MODEL).fields(AIR))
-    for name in ("body_mass", "body_inertia", "body_ipos", "body_gravcomp"):
+    for name in ("body_mass", "body_inertia", "body_ipos", "body_gravcomp", "geom_friction"):
         np.testing.assert_allclose(getattr(model, name), getattr(windy_model(), name), rtol=1e-5, atol=1e-7)
 
     def net_vertical_force(model: mujoco.MjModel) -> float:
@@ -157,6 +168,32 @@ def test_rounding_a_delay_adjusts_correlated_parameters():
     assert found.vector == pytest.approx(fitted(np.array([0.06, 0.0])).vector)
     rounding = np.array([1.0, covariance[0, 1] / covariance[0, 0]]) ** 2 * step**2 / 12
     np.testing.assert_allclose(np.diag(found.covariance), np.diag(covariance) + rounding, rtol=1e-6)
+
+
+@pytest.mark.parametrize("best", [-0.62, -0.37, 0.0, 0.24])
+def test_friction_is_found_beyond_kinks_of_the_cost(best: float):
+    """The cost has a small local minimum at each step of the search, and the other parameter follows the friction."""
+    number = 0
+
+    def fitted(vector: np.ndarray) -> Optimum:
+        nonlocal number
+        number += 1
+        cost = abs(vector[0] - best) + 0.01 * np.cos(2 * np.pi * vector[0] / 0.05)
+        return Optimum(np.array([vector[0], 3 * vector[0]]), np.zeros((2, 2)), float(cost))
+
+    found = along_friction(fitted(np.zeros(2)), np.array([True, False]), fitted)
+    assert found.vector[0] == pytest.approx(best, abs=0.1)
+    assert found.vector[1] == 3 * found.vector[0]
+    assert number <= 9
+
+
+def test_friction_never_vanishes():
+    found = along_friction(
+        Optimum(np.zeros(1), np.zeros((1, 1)), 0.0),
+        np.array([True]),
+        lambda vector: Optimum(vector, np.zeros((1, 1)), float(vector[0])),
+    )
+    assert LEAST_FRICTION <= found.vector[0] < -0.7
 
 
 def test_drag_opposes_the_motion_for_any_heading():
@@ -198,6 +235,7 @@ def test_fit_recovers_known_air_from_another_simulator(found: AirFit):
     drag, true = (np.array(p.linear_drag + p.quadratic_drag * speed) for p in (got, AIR))
     # Only the forward axis, because the robot hardly moves along the others.
     assert drag[0] == pytest.approx(true[0], rel=0.15)
+    assert float(got.friction) == pytest.approx(-0.3, abs=0.1)  # the finest step of the search
     assert found.cost[1] < 0.02 * found.cost[0]
     assert 0 < float(errors.added_mass) < 0.3 * float(got.added_mass)
 
@@ -236,7 +274,7 @@ def test_scales_grow_with_the_body_as_geometry_says():
     large.body_mass[:] *= 8
     large_scales = air_scales(robot, large)
     powers = {"added_mass": 3, "added_inertia": 5, "lift": 3, "centre": 1, "linear_drag": 2, "quadratic_drag": 2}
-    powers |= {"turning_drag": 4, "delay": 0}
+    powers |= {"turning_drag": 4, "delay": 0, "friction": 0}
     assert set(powers) == set(AIR_PARAMETERS)
     for name, power in powers.items():
         assert large_scales[name].typical == pytest.approx(2**power * small_scales[name].typical)
@@ -256,6 +294,19 @@ def test_parameters_are_read_back_from_their_file(tmp_path: Path):
     read = read_air_parameters(path, load_robot())
     for name in AIR_PARAMETERS:
         np.testing.assert_allclose(getattr(read, name), getattr(AIR, name), rtol=1e-6)
+
+
+def test_files_of_the_first_format_have_the_friction_of_the_model(tmp_path: Path):
+    path = tmp_path / AERODYNAMICS_FILE
+    parameters = air_parameters_to_json(AIR)
+    del parameters["friction"]
+    path.write_text(json.dumps({"format": "ballu-air/1", "parameters": parameters}))
+    read = read_air_parameters(path, load_robot())
+    assert float(read.friction) == 0.0
+    assert float(read.delay) == pytest.approx(0.05)
+    path.write_text(json.dumps({"format": AERODYNAMICS_FORMAT, "parameters": parameters}))
+    with pytest.raises(InputError, match="friction must be a number"):
+        read_air_parameters(path, load_robot())
 
 
 @pytest.mark.parametrize("timestep", [0.05, 0.03333333333])
@@ -279,6 +330,7 @@ def test_the_longest_delay_is_read_back_despite_its_rounding(tmp_path: Path, tim
         ({"centre": [0.0, 0.1]}, "centre must be three numbers"),
         ({"lift": "much"}, "lift must be a number"),
         ({"lift": float("nan")}, "lift must be a number"),
+        ({"friction": -1.0}, "friction is -1.0; it must be -0.95 or more"),
         ({"viscosity": 1.0}, "no parameter 'viscosity'"),
     ],
 )

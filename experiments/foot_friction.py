@@ -1,0 +1,116 @@
+# %% [markdown]
+# # Friction of the feet
+#
+# The aerodynamic residual also identifies the sliding friction of contacts. This experiment shows what it contributes:
+# on several virtual robots, the air is identified with the model's friction, and with a friction that is identified too.
+# Both are tested on twelve fresh recordings. The table has ratios of the errors to those of the nominal robot without
+# air. It also has the identified coefficient of friction, and the mean of the robot's own two feet.
+#
+# Robots are of the package's own family (`--own`), or of PyBullet's (`--bullet`, needs the extra `bench`).
+# `python experiments/foot_friction.py` takes about a quarter of an hour for each robot on one core. `--quick` is a short
+# trial run.
+
+# %%
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+sys.path += ["experiments", "benchmarks"]  # a notebook runs in the repository's root
+
+import _setup
+
+_setup.prepare()
+
+import collect_runs
+import fidelity
+import numpy as np
+from final_tier import record_all
+
+from ballu_mjx.ballu.model import load_model
+from ballu_mjx.ballu.virtual import dataset
+from ballu_mjx.ballu.virtual.hardware import Hardware, VirtualHardware
+from ballu_mjx.cli import pipeline
+from ballu_mjx.common.results import Cell, Table
+from ballu_mjx.identification.actuators import ACTUATORS_FILE
+from ballu_mjx.residuals.trained_residual import TrainedResidual
+from ballu_mjx.robots.registry import load_robot
+
+HORIZON = 5.0
+"""Horizon of the errors (s)."""
+METHODS = ("air-friction", fidelity.AIR)
+"""Methods of `fidelity.METHODS`, without and with identified friction."""
+
+# %% [markdown]
+# ## Robots
+
+
+# %%
+def robots(own: list[int], bullet: list[int]) -> dict[str, tuple[Hardware, tuple[float, float]]]:
+    """Return robots with the coefficients of friction of their feet (left, right), by name."""
+    found: dict[str, tuple[Hardware, tuple[float, float]]] = {}
+    for seed in own:
+        hardware = VirtualHardware.draw(seed)
+        found[f"own {seed}"] = hardware, hardware.robot.foot_friction
+    if bullet:
+        from bullet_family import BulletHardware  # needs the extra `bench`  # pyright: ignore[reportMissingImports]
+
+        for seed in bullet:
+            hardware = BulletHardware.draw(seed)
+            found[f"PyBullet {seed}"] = hardware, hardware.robot.foot_friction
+    return found
+
+
+# %% [markdown]
+# ## Measurement
+
+
+# %%
+def measure(
+    name: str, hardware: Hardware, friction: tuple[float, float], recording: int, folder: Path, quick: bool
+) -> list[tuple[str | Cell, ...]]:
+    """Identify one robot's actuators and air, and return its rows of the table. Finished stages are kept."""
+    place = folder / "recordings"
+    free = record_all(hardware, [job for job in dataset.jobs() if job.split != "test"], place)
+    fresh = record_all(hardware, dataset.fresh_jobs(recording, 1 if quick else 6), place)["fresh"]
+    stages = pipeline.PipelineStages(pipeline.Options(output=folder, quick=quick), 0, hardware)
+    actuators = stages.identified() / ACTUATORS_FILE
+    recorded = fidelity.Recorded(free["training"], free["validation"], fresh, actuators)
+    folders = fidelity.learn(METHODS, [0], folder / "fits", recorded, quick=quick)
+    vanilla = fidelity.vanilla_errors(folders[fidelity.AIR][0], fresh)
+    found = {method: [fidelity.load(folders[method][0]).residual] for method in METHODS}
+    columns = [(group, quantity) for group in ("near", "far") for quantity in ("position", "orientation")]
+    errors = collect_runs.remaining_errors(vanilla, found, columns, HORIZON)
+    nominal = float(load_model().geom("foot_left").friction[0])
+    params = TrainedResidual.load(folders[fidelity.AIR][0], load_robot()).params
+    coefficients: dict[str, str | Cell] = {
+        "air-friction": Cell((nominal,)),
+        fidelity.AIR: Cell((nominal * (1 + float(params.friction)),)),
+    }
+    own = Cell((float(np.mean(friction)),))
+    return [(name, fidelity.METHODS[method].label, *errors[method], coefficients[method], own) for method in METHODS]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Measure what the identified friction of the feet contributes.")
+    parser.add_argument("--own", type=int, nargs="*", default=[1, 2], help="seeds of robots of the own family (1 2)")
+    parser.add_argument("--bullet", type=int, nargs="*", default=[0, 1, 2], help="seeds of PyBullet's robots (0 1 2)")
+    parser.add_argument("--fresh", type=int, default=2026, help="seed of the test recordings")
+    parser.add_argument("--quick", action="store_true", help="one robot, for a minute; the numbers mean nothing")
+    parser.add_argument("--results", type=Path, help="JSON file to write the table to")
+    options = _setup.parse(parser, Path("runs/foot-friction"))
+    _setup.reserve(options.output, fresh=options.fresh, quick=options.quick)
+    chosen = robots(options.own[:1], []) if options.quick else robots(options.own, options.bullet)
+    rows = []
+    for name, (hardware, friction) in chosen.items():
+        folder = options.output / name.replace(" ", "-").lower()
+        rows += measure(name, hardware, friction, options.fresh, folder, options.quick)
+    heads = (f"{group}: {called}" for group in ("near", "far") for called in ("position", "yaw"))
+    columns = ("robot", f"{HORIZON:g} s", *heads, "friction in the simulator", "friction of the robot")
+    seeds = {"own_robot": options.own, "pybullet_robot": options.bullet, "recording": [options.fresh]}
+    _setup.write_tables({"robots": Table(columns, tuple(rows))}, options.output, options.results, seeds)
+
+
+if __name__ == "__main__":
+    _setup.run(main)
