@@ -1,14 +1,14 @@
 # %% [markdown]
 # # Friction of the feet
 #
-# The aerodynamic residual also identifies the sliding friction of contacts. This experiment shows what it contributes:
-# on several virtual robots, the air is identified with the model's friction, and with a friction that is identified too.
-# Both are tested on twelve fresh recordings. The table has ratios of the errors to those of the nominal robot without
-# air. It also has the identified coefficient of friction, and the mean of the robot's own two feet.
+# The aerodynamic residual also identifies the sliding friction of contacts. This experiment shows what it contributes.
+# On several virtual robots, the air is identified with the model's friction, and together with the friction. Both are
+# tested on twelve fresh recordings. The table has ratios of the errors to those of the nominal robot without air. It
+# also has the identified coefficient of friction, and the mean of the robot's own two feet.
 #
 # Robots are of the package's own family (`--own`), or of PyBullet's (`--bullet`, needs the extra `bench`).
-# `python experiments/foot_friction.py` takes about a quarter of an hour for each robot on one core. `--quick` is a short
-# trial run.
+# `python experiments/foot_friction.py` takes about a quarter of an hour for each robot on one core. `--quick` is a
+# short trial run.
 
 # %%
 from __future__ import annotations

@@ -18,7 +18,7 @@ from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.runs.progress import PhaseProgress
 from ballu_mjx.runs.record import TrainingRecord
 
-QUICK: Mapping[str, Any] = {"window_seconds": 0.5, "interval_seconds": 2.0, "evaluations": 3}
+QUICK: Mapping[str, Any] = {"window_seconds": 0.5, "interval_seconds": 2.0, "evaluations": 3, "frictions": 1}
 """Defaults of `AirConfig` under `--quick`."""
 
 
@@ -61,8 +61,8 @@ def train(data: AirData, fit: AirConfig) -> int:
 
 
 COMMAND = TrainCommand(
-    "Identify parameters of the air around the robot (added mass, drag, lift and its centre) by least squares through "
-    "the simulation. Evaluate them on test recordings. No network is trained.",
+    "Identify parameters of the air around the robot (added mass, drag, lift and its centre) and the friction of its "
+    "contacts by least squares through the simulation. Evaluate them on test recordings. No network is trained.",
     {"data": AirData(), "fit": AirConfig()},
     train,
     {"fit": QUICK},

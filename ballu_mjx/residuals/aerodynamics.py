@@ -59,8 +59,8 @@ class AirParameters:
     looks like that of a heavier body, so a fit without the delay would overestimate the added mass."""
     friction: Float[Array, ""]
     """Sliding friction of all contacts in addition to the model's, as a share of the model's (1). It is no effect of
-    the air. But drag and sliding feet both slow a walking robot, so a fit without it would put errors of the friction
-    into the drag."""
+    the air. But drag and sliding contacts both slow a walking robot, so a fit without it would put errors of the
+    friction into the drag."""
 
     @staticmethod
     def none() -> AirParameters:

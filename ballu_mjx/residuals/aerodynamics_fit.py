@@ -58,6 +58,9 @@ class AirConfig:
     evaluations: int = 15
     """Largest number of evaluations of the least-squares solver with all parameters free. With fewer free parameters,
     which take less time for an evaluation, it is proportionally larger."""
+    frictions: int = 10
+    """Largest number of values of the friction that are tried. All other parameters are fitted again at each, in up to
+    four evaluations."""
 
 
 class Scale(NamedTuple):
@@ -105,12 +108,10 @@ def air_scales(robot: RobotDescription, model: mujoco.MjModel) -> dict[str, Scal
 _AIR_DENSITY, _SPHERE_DRAG, _SLOW = 1.2, 0.47, 0.25
 """Density of air (kg/m^3), drag coefficient of a sphere, and a speed (m/s) at which drag is linearized."""
 _FEW_EVALUATIONS = 4
-"""Largest number of evaluations of the solver at each friction, and at each of the two whole delays next to the fitted
-delay."""
-_FRICTION_STEPS = (0.2, 0.1)
+"""Largest number of evaluations of the solver at each friction that is tried, and at each of the two whole delays next
+to the fitted delay."""
+_FRICTION_STEPS = (0.2, 0.1, 0.05)
 """Steps in which the search moves the friction."""
-_FRICTIONS_TRIED = 8
-"""Largest number of frictions that are tried."""
 _MARGIN = 0.01
 """Distance of a starting value from its bounds, in multiples of `typical`. A solver that starts on a bound wastes its
 first steps."""
@@ -146,6 +147,8 @@ def check_air_config(config: AirConfig, control_timestep: float) -> None:
     check_motion_windows(config.window_seconds, config.interval_seconds, control_timestep)
     if config.evaluations < 1:
         raise InputError(f"--evaluations is {config.evaluations}: it must be 1 or more.")
+    if config.frictions < 0:
+        raise InputError(f"--frictions is {config.frictions}: it must be 0 or more.")
 
 
 def identify_air(
@@ -231,7 +234,11 @@ def identify_air(
     others = places[~is_friction[places]]
     found = fitted(start, others, config.evaluations)
     if "friction" in free:
-        found = along_friction(found, is_friction, lambda vector: fitted(vector, others, _FEW_EVALUATIONS))
+        found = along_friction(
+            found, is_friction, config.frictions, lambda vector: fitted(vector, others, _FEW_EVALUATIONS)
+        )
+        if found.vector[is_friction] != start[is_friction]:
+            found = fitted(found.vector, others, config.evaluations)
         covariance = fitted(found.vector, places, 1).covariance
         found = found._replace(covariance=with_rounding(covariance, is_friction, _FRICTION_STEPS[-1]))
     if "delay" in free:
@@ -256,7 +263,7 @@ def most_evaluations(config: AirConfig, free: Sequence[str]) -> int:
     others = sum(getattr(none, name).size for name in free if name != "friction")
     found = 1 + _limit(config.evaluations, others)
     if "friction" in free:
-        found += _FRICTIONS_TRIED * _limit(_FEW_EVALUATIONS, others) + 1
+        found += config.frictions * _limit(_FEW_EVALUATIONS, others) + _limit(config.evaluations, others) + 1
     if "delay" in free:
         found += 2 * _limit(_FEW_EVALUATIONS, others - 1)
     return found
@@ -278,24 +285,25 @@ class Optimum(NamedTuple):
 
 
 def along_friction(
-    found: Optimum, friction: Bool[np.ndarray, " parameters"], fitted: Callable[[np.ndarray], Optimum]
+    found: Optimum, friction: Bool[np.ndarray, " parameters"], most: int, fitted: Callable[[np.ndarray], Optimum]
 ) -> Optimum:
     """Move the friction in steps, fit the other parameters again at each, and return the optimum of lowest cost.
 
-    Feet stick or slide. The cost has kinks along the friction, at which the solver stops if it fits the friction
+    Contacts stick or slide. The cost has kinks along the friction, at which the solver stops if it fits the friction
     together with the other parameters (`docs/white_box.md`, "Friction of the feet").
 
     **Arguments**
 
     - `found`: optimum at the starting value of the friction.
     - `friction`: mask of the friction in the vector of parameters.
+    - `most`: largest number of frictions to try.
     - `fitted`: function that fits the other parameters, from a vector with another friction.
     """
     tried = 0
     for step in _FRICTION_STEPS:
         for change in (-step, step):
             before = found
-            while tried < _FRICTIONS_TRIED:
+            while tried < most:
                 moved = np.where(friction, found.vector + change, found.vector)
                 if moved[friction][0] < LEAST_FRICTION:
                     break

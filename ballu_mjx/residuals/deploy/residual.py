@@ -236,7 +236,8 @@ def _swish(x: np.ndarray) -> np.ndarray:
 class AerodynamicPart(Part):
     """Drag on the tracked body, and a delay of the commands.
 
-    The body's identified mass, inertia, centre of mass and lift are part of the model `identified.xml`.
+    The body's identified mass, inertia, centre of mass and lift, and the friction, are part of the model
+    `identified.xml`.
     """
 
     def __init__(self, part: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
