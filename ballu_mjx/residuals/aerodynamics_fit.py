@@ -290,7 +290,7 @@ def along_friction(
     """Move the friction in steps, fit the other parameters again at each, and return the optimum of lowest cost.
 
     Contacts stick or slide. The cost has kinks along the friction, at which the solver stops if it fits the friction
-    together with the other parameters (`docs/white_box.md`, "Friction of the feet").
+    together with the other parameters (`docs/white_box.md`, "Friction of contacts").
 
     **Arguments**
 
