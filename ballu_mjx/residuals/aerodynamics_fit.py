@@ -58,7 +58,7 @@ class AirConfig:
     evaluations: int = 15
     """Largest number of evaluations of the least-squares solver with all parameters free. With fewer free parameters,
     which take less time for an evaluation, it is proportionally larger."""
-    frictions: int = 10
+    frictions: int = 9
     """Largest number of values of the friction that are tried. All other parameters are fitted again at each, in up to
     four evaluations."""
 
@@ -110,8 +110,8 @@ _AIR_DENSITY, _SPHERE_DRAG, _SLOW = 1.2, 0.47, 0.25
 _FEW_EVALUATIONS = 4
 """Largest number of evaluations of the solver at each friction that is tried, and at each of the two whole delays next
 to the fitted delay."""
-_FRICTION_STEPS = (0.2, 0.1, 0.05)
-"""Steps in which the search moves the friction."""
+_FRICTION_SCAN, _FRICTION_STEPS = (-0.2, 0.2, -0.4, 0.4, -0.6), (0.1, 0.05)
+"""Changes of the friction that are tried first, and steps about the best of them."""
 _MARGIN = 0.01
 """Distance of a starting value from its bounds, in multiples of `typical`. A solver that starts on a bound wastes its
 first steps."""
@@ -287,9 +287,9 @@ class Optimum(NamedTuple):
 def along_friction(
     found: Optimum, friction: Bool[np.ndarray, " parameters"], most: int, fitted: Callable[[np.ndarray], Optimum]
 ) -> Optimum:
-    """Move the friction in steps, fit the other parameters again at each, and return the optimum of lowest cost.
+    """Try several frictions, fit the other parameters again at each, and return the optimum of lowest cost.
 
-    Contacts stick or slide. The cost has kinks along the friction, at which the solver stops if it fits the friction
+    Contacts stick or slide. The cost is rough along the friction, so the solver stops too early if it fits the friction
     together with the other parameters (`docs/white_box.md`, "Friction of contacts").
 
     **Arguments**
@@ -300,20 +300,21 @@ def along_friction(
     - `fitted`: function that fits the other parameters, from a vector with another friction.
     """
     tried = 0
+
+    def best_of(found: Optimum, changes: Sequence[float]) -> Optimum:
+        nonlocal tried
+        best = found
+        for change in changes:
+            moved = np.where(friction, found.vector + change, found.vector)
+            if tried == most or moved[friction][0] < LEAST_FRICTION:
+                continue
+            tried += 1
+            best = min(best, fitted(moved), key=lambda fit: fit.cost)
+        return best
+
+    found = best_of(found, _FRICTION_SCAN)
     for step in _FRICTION_STEPS:
-        for change in (-step, step):
-            before = found
-            while tried < most:
-                moved = np.where(friction, found.vector + change, found.vector)
-                if moved[friction][0] < LEAST_FRICTION:
-                    break
-                tried += 1
-                candidate = fitted(moved)
-                if candidate.cost >= found.cost:
-                    break
-                found = candidate
-            if found is not before:  # the other direction leads back
-                break
+        found = best_of(found, (-step, step))
     return found
 
 

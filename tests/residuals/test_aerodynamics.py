@@ -170,26 +170,26 @@ def test_rounding_a_delay_adjusts_correlated_parameters():
     np.testing.assert_allclose(np.diag(found.covariance), np.diag(covariance) + rounding, rtol=1e-6)
 
 
-@pytest.mark.parametrize("best", [-0.62, -0.37, 0.0, 0.24])
-def test_friction_is_found_beyond_kinks_of_the_cost(best: float):
-    """The cost has a small local minimum at each step of the search, and the other parameter follows the friction."""
+@pytest.mark.parametrize("best", [-0.66, -0.37, 0.0, 0.24, 0.47])
+def test_friction_is_found_beyond_a_flat_part_of_the_cost(best: float):
+    """The cost is flat but for small waves, until the friction is near the best one. The other parameter follows."""
     number = 0
 
     def fitted(vector: np.ndarray) -> Optimum:
         nonlocal number
         number += 1
-        cost = abs(vector[0] - best) + 0.01 * np.cos(2 * np.pi * vector[0] / 0.05)
+        cost = min(abs(vector[0] - best), 0.12) + 0.001 * np.cos(2 * np.pi * vector[0] / 0.03)
         return Optimum(np.array([vector[0], 3 * vector[0]]), np.zeros((2, 2)), float(cost))
 
-    found = along_friction(fitted(np.zeros(2)), np.array([True, False]), 10, fitted)
+    found = along_friction(fitted(np.zeros(2)), np.array([True, False]), 9, fitted)
     assert found.vector[0] == pytest.approx(best, abs=0.051)
     assert found.vector[1] == 3 * found.vector[0]
-    assert number <= 11
+    assert number <= 10
 
 
 def test_friction_never_vanishes():
     found = along_friction(
-        Optimum(np.zeros(1), np.zeros((1, 1)), 0.0),
+        Optimum(np.full(1, -0.5), np.zeros((1, 1)), 0.0),
         np.array([True]),
         20,
         lambda vector: Optimum(vector, np.zeros((1, 1)), float(vector[0])),

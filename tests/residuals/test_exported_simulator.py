@@ -111,7 +111,7 @@ def air(robot: RobotDescription, delay: float) -> BoundResidual:
         quadratic_drag=jnp.array([0.3, 0.2, 0.1]),
         turning_drag=jnp.array([0.01, 0.02, 0.01]),
         delay=jnp.float32(delay),
-        friction=jnp.float32(-0.3),
+        friction=jnp.float32(-0.1),
     )
     return BoundResidual(Aerodynamics(robot, robot.load_model()), params)
 
