@@ -124,6 +124,20 @@ def record_all(hardware: Hardware, wanted: Sequence[dataset.Job], folder: Path) 
     return found
 
 
+def recorded_on(hardware: Hardware, recording: int, folder: Path, quick: bool) -> fidelity.Recorded:
+    """Return recordings and identified actuators of a robot. They are made in `folder` unless they are there.
+
+    Training and validation recordings have the commands of the bundled data set. `recording` is the seed of the test
+    recordings.
+    """
+    place = folder / "recordings"
+    free = record_all(hardware, [job for job in dataset.jobs() if job.split != "test"], place)
+    fresh = record_all(hardware, dataset.fresh_jobs(recording, 1 if quick else 6), place)["fresh"]
+    # The seed is that of trainings, and the identification has none.
+    stages = pipeline.PipelineStages(pipeline.Options(output=folder, quick=quick), 0, hardware)
+    return fidelity.Recorded(free["training"], free["validation"], fresh, stages.identified() / ACTUATORS_FILE)
+
+
 Ratios = Mapping[str, Mapping[str, Mapping[str, Sequence[float | None]]]]
 """Errors by horizon (s), simulator, and group and quantity. Vanilla has its error (m or deg). Other simulators have
 ratios to it, one for each training seed. None for simulations that diverged."""
@@ -132,22 +146,13 @@ ratios to it, one for each training seed. None for simulations that diverged."""
 def measure_fidelity(
     hardware: Hardware, training: Sequence[int], recording: int, folder: Path, quick: bool
 ) -> dict[str, dict[str, dict[str, list[float | None]]]]:
-    """Return `Ratios` of all simulators on fresh recordings of a robot.
-
-    The training and validation recordings are those of the bundled data set, made on this robot. `recording` is the
-    seed of the test recordings.
-    """
-    place = folder / "recordings"
-    free = record_all(hardware, [job for job in dataset.jobs() if job.split != "test"], place)
-    fresh = record_all(hardware, dataset.fresh_jobs(recording, 1 if quick else 6), place)["fresh"]
-    stages = pipeline.PipelineStages(pipeline.Options(output=folder, quick=quick), training[0], hardware)
-    actuators = stages.identified() / ACTUATORS_FILE
-    recorded = fidelity.Recorded(free["training"], free["validation"], fresh, actuators)
+    """Return `Ratios` of all simulators on fresh recordings of a robot (`recorded_on`)."""
+    recorded = recorded_on(hardware, recording, folder, quick)
     chosen = {*METHODS, "identified", fidelity.AIR}
     methods = [name for name in fidelity.METHODS if name in chosen]
     folders = fidelity.learn(methods, list(training), folder / "fidelity", recorded, quick=quick)
     found = {name: [fidelity.load(member) for member in members] for name, members in folders.items()}
-    rows = fidelity.rows_of(fidelity.vanilla_errors(folders["identified"][0], fresh), found)
+    rows = fidelity.rows_of(fidelity.vanilla_errors(folders["identified"][0], recorded.test), found)
     columns = [(group, quantity) for group in fidelity.groups_of(rows) for quantity in ("position", "orientation")]
     others = {label: runs for label, runs in rows.items() if label != "vanilla"}
     return {

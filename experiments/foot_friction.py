@@ -26,14 +26,11 @@ _setup.prepare()
 import collect_runs
 import fidelity
 import numpy as np
-from final_tier import record_all
+from final_tier import recorded_on
 
 from ballu_mjx.ballu.model import load_model
-from ballu_mjx.ballu.virtual import dataset
 from ballu_mjx.ballu.virtual.hardware import Hardware, VirtualHardware
-from ballu_mjx.cli import pipeline
 from ballu_mjx.common.results import Cell, Table
-from ballu_mjx.identification.actuators import ACTUATORS_FILE
 from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.robots.registry import load_robot
 
@@ -71,14 +68,9 @@ def measure(
     name: str, hardware: Hardware, friction: tuple[float, float], recording: int, folder: Path, quick: bool
 ) -> list[tuple[str | Cell, ...]]:
     """Identify one robot's actuators and air, and return its rows of the table. Finished stages are kept."""
-    place = folder / "recordings"
-    free = record_all(hardware, [job for job in dataset.jobs() if job.split != "test"], place)
-    fresh = record_all(hardware, dataset.fresh_jobs(recording, 1 if quick else 6), place)["fresh"]
-    stages = pipeline.PipelineStages(pipeline.Options(output=folder, quick=quick), 0, hardware)
-    actuators = stages.identified() / ACTUATORS_FILE
-    recorded = fidelity.Recorded(free["training"], free["validation"], fresh, actuators)
+    recorded = recorded_on(hardware, recording, folder, quick)
     folders = fidelity.learn(METHODS, [0], folder / "fits", recorded, quick=quick)
-    vanilla = fidelity.vanilla_errors(folders[fidelity.AIR][0], fresh)
+    vanilla = fidelity.vanilla_errors(folders[fidelity.AIR][0], recorded.test)
     found = {method: [fidelity.load(folders[method][0]).residual] for method in METHODS}
     columns = [(group, quantity) for group in ("near", "far") for quantity in ("position", "orientation")]
     errors = collect_runs.remaining_errors(vanilla, found, columns, HORIZON)

@@ -126,7 +126,7 @@ class LocomotionEnv(Env):
         if "geom_friction" in changed:  # The residual's friction scales the model's, and so the range of the draws.
             own = model.geom_friction[self._colliding, 0]
             ratio = changed["geom_friction"][self._colliding, 0] / np.where(own > 0, own, 1.0)
-            friction = friction * ratio[:, None]
+            friction = friction * jnp.where(own > 0, ratio, 1.0)[:, None]
         self.setting = setting._replace(fields=fields, friction=friction)
         self._rest = jnp.asarray(robot.adapter.rest_command(robot, model), jnp.float32)
 

@@ -110,8 +110,9 @@ _AIR_DENSITY, _SPHERE_DRAG, _SLOW = 1.2, 0.47, 0.25
 _FEW_EVALUATIONS = 4
 """Largest number of evaluations of the solver at each friction that is tried, and at each of the two whole delays next
 to the fitted delay."""
-_FRICTION_SCAN, _FRICTION_STEPS = (-0.2, 0.2, -0.4, 0.4, -0.6), (0.1, 0.05)
-"""Changes of the friction that are tried first, and steps about the best of them."""
+_FRICTION_STEP = 0.05
+_FRICTION_ROUNDS = ((-0.2, 0.2, -0.4, 0.4, -0.6), (-0.1, 0.1), (-_FRICTION_STEP, _FRICTION_STEP))
+"""Changes of the friction that are tried in each round, from the best friction of the rounds before."""
 _MARGIN = 0.01
 """Distance of a starting value from its bounds, in multiples of `typical`. A solver that starts on a bound wastes its
 first steps."""
@@ -240,7 +241,7 @@ def identify_air(
         if found.vector[is_friction] != start[is_friction]:
             found = fitted(found.vector, others, config.evaluations)
         covariance = fitted(found.vector, places, 1).covariance
-        found = found._replace(covariance=with_rounding(covariance, is_friction, _FRICTION_STEPS[-1]))
+        found = found._replace(covariance=with_rounding(covariance, is_friction, _FRICTION_STEP))
     if "delay" in free:
         found = at_whole_delay(
             found,
@@ -300,21 +301,13 @@ def along_friction(
     - `fitted`: function that fits the other parameters, from a vector with another friction.
     """
     tried = 0
-
-    def best_of(found: Optimum, changes: Sequence[float]) -> Optimum:
-        nonlocal tried
-        best = found
+    for changes in _FRICTION_ROUNDS:
+        middle = found.vector
         for change in changes:
-            moved = np.where(friction, found.vector + change, found.vector)
-            if tried == most or moved[friction][0] < LEAST_FRICTION:
-                continue
-            tried += 1
-            best = min(best, fitted(moved), key=lambda fit: fit.cost)
-        return best
-
-    found = best_of(found, _FRICTION_SCAN)
-    for step in _FRICTION_STEPS:
-        found = best_of(found, (-step, step))
+            moved = np.where(friction, middle + change, middle)
+            if tried < most and moved[friction][0] >= LEAST_FRICTION:
+                tried += 1
+                found = min(found, fitted(moved), key=lambda fit: fit.cost)
     return found
 
 

@@ -53,30 +53,35 @@ AIR = AirParameters(
     quadratic_drag=jnp.array([0.25, 0.15, 0.2]),
     turning_drag=jnp.array([2e-3, 3e-3, 4e-3]),
     delay=jnp.array(0.05),
-    friction=jnp.array(-0.3),  # one of the values that the search tries
+    friction=jnp.array(0.0),
 )
+SLIPPERY = dataclasses.replace(AIR, friction=jnp.array(-0.3))
+"""The same air with lower friction, which is one of the values that the search tries."""
 CONFIG = AirConfig(window_seconds=0.5, interval_seconds=0.5)
 """In windows this short, contacts hardly amplify errors."""
 COMMANDS = jnp.zeros((HISTORY, 2))
 
 
-def windy_model() -> mujoco.MjModel:
-    """Return C MuJoCo's model of the robot with mass, inertia, centre, lift and friction of `AIR`, from definitions."""
+def windy_model(friction: float = 0.0) -> mujoco.MjModel:
+    """Return C MuJoCo's model of the robot with the mass, inertia, centre and lift of `AIR`, from their definitions.
+
+    `friction` is the share by which contacts have more friction than in the robot's model.
+    """
     model = load_model()
     body = model.body("balloon").id
     lift = model.body_gravcomp[body] * model.body_mass[body] * 9.81 - 0.12 + 0.12 * 9.81
     model.body_mass[body] += 0.12
     model.body_inertia[body] += 3e-3
     model.body_ipos[body] += [0.004, 0.013, 0.0]
-    model.geom_friction[:, 0] *= 0.7
+    model.geom_friction[:, 0] *= 1 + friction
     model.body_gravcomp[body] = lift / (model.body_mass[body] * 9.81)
     mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
 
 
-def blown(name: str, period: float, phase: float, steps: int = 160) -> Motion:
+def blown(name: str, period: float, phase: float, steps: int = 160, friction: float = 0.0) -> Motion:
     """Simulate the nominal robot in `AIR` in C MuJoCo. Drag uses MuJoCo's velocities in every physics step."""
-    model = windy_model()
+    model = windy_model(friction)
     data = mujoco.MjData(model)
     data.qpos[:] = standing_qpos(model)
     body, site = model.body("balloon").id, model.site("balloon").id
@@ -132,9 +137,9 @@ def test_parameters_without_air_leave_the_nominal_model():
 
 def test_added_mass_has_no_weight_and_lift_is_a_vertical_force():
     model = load_model()
-    set_fields(model, Aerodynamics(load_robot(), MODEL).fields(AIR))
+    set_fields(model, Aerodynamics(load_robot(), MODEL).fields(SLIPPERY))
     for name in ("body_mass", "body_inertia", "body_ipos", "body_gravcomp", "geom_friction"):
-        np.testing.assert_allclose(getattr(model, name), getattr(windy_model(), name), rtol=1e-5, atol=1e-7)
+        np.testing.assert_allclose(getattr(model, name), getattr(windy_model(-0.3), name), rtol=1e-5, atol=1e-7)
 
     def net_vertical_force(model: mujoco.MjModel) -> float:
         """Return the net vertical force (N) of weight and lift on the whole robot, above the floor and at rest."""
@@ -214,9 +219,17 @@ def test_drag_opposes_the_motion_for_any_heading():
     np.testing.assert_allclose(wrench[3:], turned @ level[3:], rtol=2e-2, atol=1e-6)
 
 
+GAITS = {"one": (1.2, 0.5), "two": (1.7, 0.35), "three": (0.9, 0.6)}
+
+
 @pytest.fixture(scope="module")
 def motions() -> list[Motion]:
-    return [blown("one", 1.2, 0.5), blown("two", 1.7, 0.35), blown("three", 0.9, 0.6)]
+    return [blown(name, *gait) for name, gait in GAITS.items()]
+
+
+@pytest.fixture(scope="module")
+def slippery_motions() -> list[Motion]:
+    return [blown(name, *gait, friction=-0.3) for name, gait in GAITS.items()]
 
 
 @pytest.fixture(scope="module")
@@ -228,7 +241,7 @@ def test_fit_recovers_known_air_from_another_simulator(found: AirFit):
     """Errors of sign and frame in any parameter would be detected."""
     got, errors = found.parameters, found.standard_errors
     assert float(got.delay) == pytest.approx(0.05, abs=1e-6)
-    assert float(got.added_mass) == pytest.approx(0.12, rel=0.08)  # half a standard error, with unknown friction
+    assert float(got.added_mass) == pytest.approx(0.12, rel=0.05)
     assert float(got.added_inertia) == pytest.approx(3e-3, rel=0.1)
     assert float(got.lift) == pytest.approx(-0.12, abs=0.004)
     np.testing.assert_allclose(got.centre[:2], [0.004, 0.013], atol=7e-4)
@@ -236,7 +249,7 @@ def test_fit_recovers_known_air_from_another_simulator(found: AirFit):
     drag, true = (np.array(p.linear_drag + p.quadratic_drag * speed) for p in (got, AIR))
     # Only the forward axis, because the robot hardly moves along the others.
     assert drag[0] == pytest.approx(true[0], rel=0.15)
-    assert float(got.friction) == pytest.approx(-0.3, abs=0.051)  # the finest step of the search
+    assert float(got.friction) == pytest.approx(0.0, abs=0.051)  # the finest step of the search
     assert found.cost[1] < 0.02 * found.cost[0]
     assert 0 < float(errors.added_mass) < 0.3 * float(got.added_mass)
 
@@ -260,9 +273,18 @@ def test_lift_can_be_fitted_with_all_other_parameters_fixed(motions: list[Motion
     assert float(fit.standard_errors.turning_drag[0]) == 0.0
 
 
-def test_friction_of_another_floor_can_be_fitted_with_all_other_parameters_fixed(motions: list[Motion]):
+def test_friction_is_found_together_with_the_air(slippery_motions: list[Motion]):
+    fit = identify_air(SIMULATOR, slippery_motions, CONFIG)
+    got, errors = fit.parameters, fit.standard_errors
+    assert float(got.friction) == pytest.approx(-0.3, abs=0.051)
+    assert float(got.delay) == pytest.approx(0.05, abs=1e-6)
+    assert float(got.added_mass) == pytest.approx(0.12, abs=float(errors.added_mass))
+    assert fit.cost[1] < 0.02 * fit.cost[0]
+
+
+def test_friction_of_another_floor_can_be_fitted_with_all_other_parameters_fixed(slippery_motions: list[Motion]):
     known = dataclasses.replace(AIR, friction=jnp.array(0.1))
-    fit = identify_air(SIMULATOR, motions, CONFIG, fixed_from=known, free=("friction",))
+    fit = identify_air(SIMULATOR, slippery_motions, CONFIG, fixed_from=known, free=("friction",))
     assert float(fit.parameters.friction) == pytest.approx(-0.3, abs=0.051)
     np.testing.assert_array_equal(fit.parameters.linear_drag, AIR.linear_drag)
     assert 0.02 < float(fit.standard_errors.friction) < 0.3
@@ -299,10 +321,10 @@ def test_recordings_shorter_than_a_window_are_refused(motions: list[Motion]):
 
 def test_parameters_are_read_back_from_their_file(tmp_path: Path):
     path = tmp_path / AERODYNAMICS_FILE
-    path.write_text(json.dumps({"format": AERODYNAMICS_FORMAT, "parameters": air_parameters_to_json(AIR)}))
+    path.write_text(json.dumps({"format": AERODYNAMICS_FORMAT, "parameters": air_parameters_to_json(SLIPPERY)}))
     read = read_air_parameters(path, load_robot())
     for name in AIR_PARAMETERS:
-        np.testing.assert_allclose(getattr(read, name), getattr(AIR, name), rtol=1e-6)
+        np.testing.assert_allclose(getattr(read, name), getattr(SLIPPERY, name), rtol=1e-6)
 
 
 def test_files_of_the_first_format_have_the_friction_of_the_model(tmp_path: Path):
