@@ -64,12 +64,19 @@ def robots(own: list[int], bullet: list[int]) -> dict[str, tuple[Hardware, tuple
 
 
 # %%
+def fits(
+    hardware: Hardware, recording: int, folder: Path, quick: bool
+) -> tuple[fidelity.Recorded, dict[str, list[Path]]]:
+    """Return recordings of a robot, and the run folder of each method. Finished stages are kept."""
+    recorded = recorded_on(hardware, recording, folder, quick)
+    return recorded, fidelity.learn(METHODS, [0], folder / "fits", recorded, quick=quick)
+
+
 def measure(
     name: str, hardware: Hardware, friction: tuple[float, float], recording: int, folder: Path, quick: bool
 ) -> list[tuple[str | Cell, ...]]:
     """Identify one robot's actuators and air, and return its rows of the table. Finished stages are kept."""
-    recorded = recorded_on(hardware, recording, folder, quick)
-    folders = fidelity.learn(METHODS, [0], folder / "fits", recorded, quick=quick)
+    recorded, folders = fits(hardware, recording, folder, quick)
     vanilla = fidelity.vanilla_errors(folders[fidelity.AIR][0], recorded.test)
     found = {method: [fidelity.load(folders[method][0]).residual] for method in METHODS}
     columns = [(group, quantity) for group in ("near", "far") for quantity in ("position", "orientation")]

@@ -37,6 +37,7 @@ SCRIPTS = {
     "fidelity.py": "fidelity",
     "fidelity_limits.py": "fidelity-limits",
     "foot_friction.py": "foot-friction",
+    "friction_transfer.py": "foot-friction",
     "real/compass_gait/compass_gait.py": "compass_gait",
     "real/double_pendulum/double_pendulum.py": "double_pendulum",
     "real/double_pendulum/residuals.py": "double_pendulum_residuals",
