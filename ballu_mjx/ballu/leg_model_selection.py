@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import f as f_distribution
+from scipy import special
 
 from ballu_mjx.ballu.model import SIDES
 from ballu_mjx.identification.undeclared import SMALL_EFFECT
@@ -49,7 +49,7 @@ def select_model(
     between, within = max(more, 1) * len(SIDES), max(chi_squared - size, 1.0)
     statistic = float(np.sum((simpler**2 - richer**2) / spread**2)) / between
     effect = float(np.sum(simpler**2 - richer**2) / max(np.sum(richer**2), np.finfo(float).tiny))
-    return Selection(statistic, float(f_distribution.ppf(1 - _LEVEL, between, within)), effect)
+    return Selection(statistic, float(special.fdtri(between, within, 1 - _LEVEL)), effect)
 
 
 _LEVEL = 0.05

@@ -19,11 +19,10 @@ import numpy as np
 import scipy.sparse
 import scipy.sparse.linalg
 from jaxtyping import Array, Float
-from scipy.signal import savgol_coeffs
 from scipy.spatial.transform import Rotation
 
 from ballu_mjx.ballu.model import HIPS, KNEES, MOTORS, SIDES
-from ballu_mjx.recordings.filters import odd_window, savitzky_golay
+from ballu_mjx.recordings.filters import noise_gain, odd_window, savitzky_golay
 from ballu_mjx.recordings.inverse_kinematics import KinematicFit
 from ballu_mjx.recordings.motion import MeasurementGrid
 
@@ -58,8 +57,7 @@ def complete_positions(fit: KinematicFit) -> KinematicFit:
     grid, parameters = fit.problem.grid, fit.problem.parameters
     if "base" in grid.orientations:
         window = odd_window(parameters.position_window, grid.step, parameters.order, len(fit.qpos))
-        shrinkage = np.linalg.norm(savgol_coeffs(window, parameters.order))
-        deviation = float(parameters.rotation_noise * shrinkage)
+        deviation = parameters.rotation_noise * noise_gain(window, parameters.order)
         return dataclasses.replace(fit, uncertainty={BASE_PITCH: deviation})
     held, deviation = _base_pitch(fit)
     return fit.refit("base", held, np.array([0.0, _PITCH_HELD, 0.0]), **{BASE_PITCH: deviation})

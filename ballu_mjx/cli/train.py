@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import pkgutil
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -19,6 +20,16 @@ from ballu_mjx.runs.layout import CONFIG_FILE
 if TYPE_CHECKING:
     from ballu_mjx.cli._command import TrainCommand
 
+_METHODS: Mapping[str, str] = {
+    "sysid": "ballu_mjx.cli.train_sysid:COMMAND",
+    "envmimic": "ballu_mjx.cli.train_envmimic:COMMAND",
+    "supervised": "ballu_mjx.cli.train_forces:SUPERVISED",
+    "analytic": "ballu_mjx.cli.train_forces:ANALYTIC",
+    "aerodynamic": "ballu_mjx.cli.train_aerodynamics:COMMAND",
+    "fluid": "ballu_mjx.cli.train_fluid:COMMAND",
+    "all": "ballu_mjx.cli.pipeline:COMMAND",
+}
+"""Places of the subcommands other than tasks, by name."""
 _SIGNALS = 128
 """Exit statuses from this number on mean that all processes of a training were interrupted together."""
 
@@ -35,7 +46,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         description = (
             "Identify actuators, learn residuals and train policies. Each subcommand explains its options with --help."
         )
-        return run_command(_commands(), arguments, description)
+        return run_command(_commands(next(iter(given), None)), given, description)
 
     status = runtime.exit_status(run, arguments)
     if 0 < status < _SIGNALS and "jax" in sys.modules:
@@ -70,26 +81,19 @@ def _is_brief(arguments: Sequence[str]) -> bool:
     return False
 
 
-def _commands() -> Mapping[str, TrainCommand]:
-    """Return the subcommands by name, in the order of use."""
-    from ballu_mjx.cli import (
-        pipeline,
-        train_aerodynamics,
-        train_envmimic,
-        train_fluid,
-        train_forces,
-        train_policy,
-        train_sysid,
-    )
+def _commands(only: str | None = None) -> Mapping[str, TrainCommand]:
+    """Return the subcommands by name, in the order of use. If `only` names one of them, return it alone.
+
+    The modules of other subcommands are then not imported, which takes a second.
+    """
+    if only is not None and only in _METHODS:
+        return {only: pkgutil.resolve_name(_METHODS[only])}
+    from ballu_mjx.cli import train_policy
     from ballu_mjx.policies.tasks import TASKS
 
-    return {
-        "sysid": train_sysid.COMMAND,
-        "envmimic": train_envmimic.COMMAND,
-        "supervised": train_forces.SUPERVISED,
-        "analytic": train_forces.ANALYTIC,
-        "aerodynamic": train_aerodynamics.COMMAND,
-        "fluid": train_fluid.COMMAND,
-        **{name: train_policy.command_for(task) for name, task in TASKS.items()},
-        "all": pipeline.COMMAND,
-    }
+    policies = {name: train_policy.command_for(task) for name, task in TASKS.items()}
+    if only is not None and only in policies:
+        return {only: policies[only]}
+    methods = {name: pkgutil.resolve_name(place) for name, place in _METHODS.items()}
+    whole = methods.pop("all")
+    return {**methods, **policies, "all": whole}

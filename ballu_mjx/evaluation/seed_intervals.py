@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 LEVEL = 0.95
 """Confidence level of the intervals in all tables."""
@@ -57,7 +57,7 @@ def t_interval(values: Sequence[float], level: float = LEVEL) -> Interval:
     if sample.size == 1:
         return Interval(mean, None)
     error = sample.std(ddof=1) / np.sqrt(sample.size)
-    return Interval(mean, float(stats.t.ppf((1 + level) / 2, sample.size - 1) * error))
+    return Interval(mean, float(special.stdtrit(sample.size - 1, (1 + level) / 2) * error))
 
 
 def seed_means(trials: Sequence[Sequence[float]]) -> list[float]:

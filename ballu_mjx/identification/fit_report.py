@@ -8,7 +8,7 @@ from typing import Any
 import mujoco
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.stats import t as student
+from scipy import special
 
 from ballu_mjx.common.files import finite_or_none
 from ballu_mjx.identification.fit_robot import HeldOut, RobotFit
@@ -21,7 +21,7 @@ def intervals(fit: RobotFit) -> Float[np.ndarray, "parameters 2"]:
     One window has no interval but the bounds.
     """
     windows = len(fit.windows.motion)
-    half = float(student.ppf(0.975, windows - 1)) * fit.standard_errors if windows > 1 else np.inf
+    half = float(special.stdtrit(windows - 1, 0.975)) * fit.standard_errors if windows > 1 else np.inf
     both = np.stack([fit.values - half, fit.values + half], axis=1)
     return np.clip(both, fit.parameters.lower[:, None], fit.parameters.upper[:, None])
 

@@ -8,10 +8,9 @@ from functools import partial
 import mujoco
 import numpy as np
 from jaxtyping import Float
-from scipy.signal import savgol_coeffs
 
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.recordings.filters import interpolate, mean_command, odd_window, savitzky_golay, unwound
+from ballu_mjx.recordings.filters import interpolate, mean_command, noise_gain, odd_window, savitzky_golay, unwound
 from ballu_mjx.recordings.motion import Motion, ReconstructionParameters
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.robots.description import RobotDescription
@@ -111,7 +110,7 @@ def measure(
     rates, narrow = (filtered(width, derivative=1) for width in (config.rate_window, config.rate_window / 2))
     window = odd_window(config.rate_window, sample / fine, config.order, len(grid))
     noise = np.where(translations(model), config.slide_noise, config.angle_noise)
-    passed = noise * np.linalg.norm(savgol_coeffs(window, config.order, deriv=1, delta=sample / fine))
+    passed = noise * noise_gain(window, config.order, sample / fine, derivative=1)
     uncertainty = np.hypot(np.std(rates - narrow, axis=0), _SURE * np.std(rates, axis=0) + 1e-6)
     # A semi-implicit integrator's velocity is the mean over the time step that led to the position.
     rates = rates - np.gradient(rates, sample / fine, axis=0) * timestep / 2

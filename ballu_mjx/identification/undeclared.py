@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import jax
 import mujoco
 import numpy as np
-from scipy.stats import t as student
+from scipy import special
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.identification.declarations import parameters_of
@@ -161,7 +161,7 @@ def _select(
     size, windows = len(declared), len(reduced.values)
     known, tried, left = reduced.slopes[..., :size], reduced.slopes[..., size:], reduced.values
     prior = declared.prior**-2.0
-    critical = student.ppf(1 - _CHANCE / 2, windows - 1)
+    critical = special.stdtrit(windows - 1, 1 - _CHANCE / 2)
     chosen: list[tuple[int, float, float]] = []
     while len(chosen) < len(candidates):
         flat = known.reshape(-1, known.shape[-1])

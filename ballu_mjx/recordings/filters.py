@@ -5,7 +5,6 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 from jaxtyping import Float
-from scipy.signal import savgol_filter
 
 from ballu_mjx.recordings.recording import Recording
 
@@ -82,8 +81,20 @@ def savitzky_golay(values: np.ndarray, width: float, step: float, order: int, de
 
     The filter has the given `width` (s) and is centred, so it adds no lag. Samples are `step` (s) apart.
     """
+    from scipy.signal import savgol_filter  # Slow to import: it needs all of scipy.stats.
+
     window = odd_window(width, step, order, len(values))
     return np.asarray(savgol_filter(values, window, order, deriv=derivative, delta=step, axis=0))
+
+
+def noise_gain(window: int, order: int, step: float = 1.0, derivative: int = 0) -> float:
+    """Return the standard deviation of `savitzky_golay`'s output for white noise of standard deviation 1.
+
+    `window` is the number of samples, which are `step` (s) apart.
+    """
+    from scipy.signal import savgol_coeffs  # Slow to import, as above.
+
+    return float(np.linalg.norm(savgol_coeffs(window, order, deriv=derivative, delta=step)))
 
 
 def smooth_rotation(

@@ -46,10 +46,10 @@ STEPS = _PPO.batch_size * _PPO.unroll_length * _PPO.num_minibatches
 """Number of control steps in a training step with these sizes."""
 
 
-def command(module: str, *arguments: object, folder: Path) -> subprocess.CompletedProcess[str]:
+def command(module: str, *arguments: object, folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
     line = [sys.executable, "-m", "ballu_mjx", module, *map(str, arguments)]
-    environment = {**os.environ, **BRIEF}
-    return subprocess.run(line, cwd=folder, env=environment, capture_output=True, text=True, timeout=600)
+    variables = {**os.environ, **BRIEF, **environment}
+    return subprocess.run(line, cwd=folder, env=variables, capture_output=True, text=True, timeout=600)
 
 
 def first_seconds(recording: Recording, duration: float) -> Recording:
@@ -254,8 +254,12 @@ def test_quick_validates_on_training_recordings_if_no_others_are_given(folder: P
 
 
 def test_help_lists_the_options_of_envmimic(folder: Path):
-    done = command("train", "envmimic", "--help", folder=folder)
+    done = command("train", "envmimic", "--help", folder=folder, PYTHONPROFILEIMPORTTIME="1")
     assert done.returncode == 0
+    # Packages that take a second to import, and that this command needs later or never.
+    imported = {line.split("|")[-1].strip() for line in done.stderr.splitlines() if line.startswith("import time:")}
+    assert "ballu_mjx.residuals.envmimic" in imported
+    assert not imported & {"matplotlib", "optimistix", "scipy.signal", "scipy.stats", "ballu_mjx.ballu.virtual"}
     for option in ("--quick", "--recordings", "--validation", "--test", "--seed", "--output", "--num-timesteps"):
         assert option in done.stdout
     for option in ("--num-envs", "--resume", "--force-limit", "--learning-rate", "of Adam"):
