@@ -74,7 +74,6 @@ QUANTITIES = {
     "linear_drag": Quantity("linear drag (N s/m)", ".3f", axes="xyz"),
     "quadratic_drag": Quantity("quadratic drag (N s^2/m^2)", ".2f", axes="xyz"),
     "turning_drag": Quantity("drag on turning (N m s)", ".4f", axes="xyz"),
-    "friction": Quantity("friction of contacts beyond the model's (%)", ".0f", 1e2),
 }
 BIASED = ("lift", "added_mass", "added_inertia", "delay")
 """Parameters that the legs' missing effects might bias."""

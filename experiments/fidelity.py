@@ -55,7 +55,7 @@ from ballu_mjx.policies.policy import Policy
 from ballu_mjx.recordings.csv_format import list_recordings, read_recording
 from ballu_mjx.recordings.reconstruct import reconstruct_for_simulator
 from ballu_mjx.recordings.recording_groups import OTHER
-from ballu_mjx.residuals.aerodynamics import AIR_PARAMETERS
+from ballu_mjx.residuals.aerodynamics import FREE_BY_DEFAULT
 from ballu_mjx.residuals.aerodynamics_training import has_delay
 from ballu_mjx.residuals.trained_residual import TrainedResidual
 from ballu_mjx.robots.model import assets
@@ -92,7 +92,7 @@ DELAY = AIR, "--free", "delay"
 
 def _air_without(*names: str) -> tuple[str, ...]:
     """Return the arguments of a training that identifies all parameters of the air but the named ones."""
-    return AIR, "--free", *(name for name in AIR_PARAMETERS if name not in names)
+    return AIR, "--free", *(name for name in FREE_BY_DEFAULT if name not in names)
 
 
 METHODS = {
@@ -107,18 +107,16 @@ METHODS = {
     "analytic-wrench": Method("analytic, wrench", ("analytic", "--forces", "wrench")),
     AIR: Method("aerodynamic", (AIR,), seeded=False),
     "air-lift": Method("aerodynamic, the model's lift", _air_without("lift"), seeded=False),
-    "air-friction": Method("aerodynamic, the model's friction", _air_without("friction"), seeded=False),
+    "air-friction": Method("aerodynamic and friction", (AIR, "--contact-friction"), seeded=False),
     "air-analytic": Method("aerodynamic+analytic", ("analytic",), beside=AIR),
     "air-envmimic": Method("aerodynamic+EnvMimic", ("envmimic",), beside=AIR),
     "delay": Method("vanilla+sysid+delay", DELAY, seeded=False),
     "delay-envmimic": Method("vanilla+sysid+delay+EnvMimic", ("envmimic",), beside="delay"),
-    "air-alone": Method(
-        "aerodynamic, no delay, centre or friction", _air_without("delay", "centre", "friction"), seeded=False
-    ),
+    "air-alone": Method("aerodynamic, no delay or centre", _air_without("delay", "centre"), seeded=False),
 }
-"""Methods by key. The last three isolate the command delay, the balloons' centre and the friction, which only the
-aerodynamic residual has. The delay is identified from the same recordings, for simulators without air. `air-alone` is
-the air without these three."""
+"""Methods by key. The last three isolate the command delay and the balloons' centre, which only the aerodynamic
+residual has. The delay is identified from the same recordings, for simulators without air. `air-alone` is the air
+without these two."""
 
 
 def train(folder: Path, *arguments: str, result: str = "evaluation.json") -> None:

@@ -1,8 +1,8 @@
 # %% [markdown]
 # # Friction of the feet
 #
-# The aerodynamic residual also identifies the sliding friction of contacts. This experiment shows what it contributes.
-# On several virtual robots, the air is identified with the model's friction, and together with the friction. Both are
+# The aerodynamic residual can also identify the sliding friction of contacts. This experiment shows what it changes. On
+# several virtual robots, the air is identified with the model's friction, and together with the friction. Both are
 # tested on twelve fresh recordings. The table has ratios of the errors to those of the nominal robot without air. It
 # also has the identified coefficient of friction, and the mean of the robot's own two feet.
 #
@@ -36,7 +36,7 @@ from ballu_mjx.robots.registry import load_robot
 
 HORIZON = 5.0
 """Horizon of the errors (s)."""
-METHODS = ("air-friction", fidelity.AIR)
+METHODS = (fidelity.AIR, "air-friction")
 """Methods of `fidelity.METHODS`, without and with identified friction."""
 
 # %% [markdown]
@@ -82,13 +82,13 @@ def measure(
     columns = [(group, quantity) for group in ("near", "far") for quantity in ("position", "orientation")]
     errors = collect_runs.remaining_errors(vanilla, found, columns, HORIZON)
     nominal = float(load_model().geom("foot_left").friction[0])
-    params = TrainedResidual.load(folders[fidelity.AIR][0], load_robot()).params
-    coefficients: dict[str, str | Cell] = {
-        "air-friction": Cell((nominal,)),
-        fidelity.AIR: Cell((nominal * (1 + float(params.friction)),)),
-    }
+    params = TrainedResidual.load(folders["air-friction"][0], load_robot()).params
+    coefficients = (Cell((nominal,)), Cell((nominal * (1 + float(params.friction)),)))
     own = Cell((float(np.mean(friction)),))
-    return [(name, fidelity.METHODS[method].label, *errors[method], coefficients[method], own) for method in METHODS]
+    return [
+        (name, fidelity.METHODS[method].label, *errors[method], coefficient, own)
+        for method, coefficient in zip(METHODS, coefficients, strict=True)
+    ]
 
 
 def main() -> None:

@@ -10,7 +10,7 @@ from typing import Any, Literal
 from ballu_mjx.cli._command import TrainCommand, load_chosen_robot
 from ballu_mjx.cli._residual import Prepared, load_earlier, show_report, train_residual
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.residuals.aerodynamics import AIR_PARAMETERS, Aerodynamics
+from ballu_mjx.residuals.aerodynamics import AIR_PARAMETERS, FREE_BY_DEFAULT, Aerodynamics
 from ballu_mjx.residuals.aerodynamics_fit import AirConfig, check_air_config
 from ballu_mjx.residuals.aerodynamics_training import fit_aerodynamics
 from ballu_mjx.residuals.dataset import RecordingsData
@@ -30,16 +30,23 @@ class AirData(RecordingsData):
     """Folder of an earlier run. Parameters that are not in --free keep their values of that run. For example, balloons
     lose lift over weeks, and `--fixed-from RUN --free lift` identifies the present lift from one recording. The
     actuators are those of that run, unless --actuators names others. Without this option: they are 0."""
-    free: tuple[Literal[AIR_PARAMETERS], ...] = AIR_PARAMETERS  # pyright: ignore[reportInvalidTypeForm]
+    free: tuple[Literal[AIR_PARAMETERS], ...] = FREE_BY_DEFAULT  # pyright: ignore[reportInvalidTypeForm]
     """Parameters to identify. The others keep their values of --fixed-from, or are 0. Leave out the lift if the model
     has a weighed value: the fit can attribute errors of the legs' model to the lift."""
+    contact_friction: bool = False
+    """Also identify the sliding friction of contacts, as if --free named it. The simulator then predicts recordings
+    better, but policies can transfer worse (docs/white_box.md)."""
+
+    def identified(self) -> tuple[str, ...]:
+        """Return the names of the parameters to identify."""
+        return tuple(dict.fromkeys((*self.free, *(["friction"] if self.contact_friction else []))))
 
 
 def train(data: AirData, fit: AirConfig) -> int:
     """Read and check all inputs, identify the air, evaluate the result, and return the exit status."""
     robot = load_chosen_robot(data.robot, residual=data.fixed_from)
     check_air_config(fit, robot.control_timestep)
-    if not data.free:
+    if not data.identified():
         raise InputError(f"--free names no parameter; choose from {', '.join(AIR_PARAMETERS)}.")
     earlier = load_earlier(data.fixed_from, robot, Aerodynamics, "aerodynamic")
 
@@ -49,7 +56,7 @@ def train(data: AirData, fit: AirConfig) -> int:
             prepared.motions["training"],
             fit,
             fixed_from=None if earlier is None else earlier.residual,
-            free=data.free,
+            free=data.identified(),
             run=run,
             progress=PhaseProgress(),
         )
@@ -61,8 +68,8 @@ def train(data: AirData, fit: AirConfig) -> int:
 
 
 COMMAND = TrainCommand(
-    "Identify parameters of the air around the robot (added mass, drag, lift and its centre) and the friction of its "
-    "contacts by least squares through the simulation. Evaluate them on test recordings. No network is trained.",
+    "Identify parameters of the air around the robot (added mass, drag, lift and its centre) by least squares through "
+    "the simulation. Evaluate them on test recordings. No network is trained.",
     {"data": AirData(), "fit": AirConfig()},
     train,
     {"fit": QUICK},

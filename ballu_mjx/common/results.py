@@ -107,6 +107,7 @@ class Results:
         seeds = "".join(
             f" {use.capitalize()} {_counted('seed', len(s))}: {', '.join(map(str, s))}."
             for use, s in self.seeds.items()
+            if s
         )
         seeds += " One seed on one robot ranks nothing." if len(self.seeds.get("training", (0, 1))) == 1 else ""
         cores = int(self.machine["cores"])

@@ -75,6 +75,8 @@ _READ = ("ballu-air/1", AERODYNAMICS_FORMAT)
 """Formats that can be read. Files of the first one have no friction, which is then 0."""
 AERODYNAMICS_FILE = "air.json"
 AIR_PARAMETERS = tuple(field.name for field in dataclasses.fields(AirParameters))
+FREE_BY_DEFAULT = tuple(name for name in AIR_PARAMETERS if name != "friction")
+"""Parameters that are fitted unless others are named."""
 SIGNED_AIR_PARAMETERS = ("lift", "centre", "friction")
 """Parameters that may be negative."""
 LEAST_FRICTION = -0.95

@@ -34,6 +34,7 @@ from ballu_mjx.recordings.motion_windows import (
 from ballu_mjx.recordings.window_errors import OUTLIER_THRESHOLD, fill_diverged, pseudo_huber
 from ballu_mjx.residuals.aerodynamics import (
     AIR_PARAMETERS,
+    FREE_BY_DEFAULT,
     LEAST_FRICTION,
     SIGNED_AIR_PARAMETERS,
     Aerodynamics,
@@ -59,8 +60,8 @@ class AirConfig:
     """Largest number of evaluations of the least-squares solver with all parameters free. With fewer free parameters,
     which take less time for an evaluation, it is proportionally larger."""
     frictions: int = 9
-    """Largest number of values of the friction that are tried. All other parameters are fitted again at each, in up to
-    four evaluations."""
+    """Largest number of values of the contacts' friction that are tried, if it is identified. All other parameters are
+    fitted again at each, in up to four evaluations."""
 
 
 class Scale(NamedTuple):
@@ -159,7 +160,7 @@ def identify_air(
     report: Report = lambda evaluations, cost: None,
     *,
     fixed_from: AirParameters | None = None,
-    free: Sequence[str] = AIR_PARAMETERS,
+    free: Sequence[str] = FREE_BY_DEFAULT,
 ) -> AirFit:
     """Fit `AirParameters` to recorded motions.
 

@@ -15,6 +15,7 @@ from ballu_mjx.residuals.aerodynamics import (
     AERODYNAMICS_FILE,
     AERODYNAMICS_FORMAT,
     AIR_PARAMETERS,
+    FREE_BY_DEFAULT,
     Aerodynamics,
     air_parameters_to_json,
 )
@@ -33,7 +34,7 @@ def fit_aerodynamics(
     config: AirConfig | None = None,
     *,
     fixed_from: TrainedResidual | None = None,
-    free: Sequence[str] = AIR_PARAMETERS,
+    free: Sequence[str] = FREE_BY_DEFAULT,
     run: TrainingRecord | None = None,
     progress: PhaseProgress | None = None,
 ) -> TrainedResidual:

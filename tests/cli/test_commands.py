@@ -15,11 +15,12 @@ import pytest
 from ballu_mjx import __main__ as package
 from ballu_mjx import cli
 from ballu_mjx.__main__ import COMMANDS, NAMES
-from ballu_mjx.cli import completion, train, train_envmimic, train_fluid, train_forces
+from ballu_mjx.cli import completion, train, train_aerodynamics, train_envmimic, train_fluid, train_forces
 from ballu_mjx.cli._command import TrainCommand, run_command
 from ballu_mjx.common import runtime
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.importers.readers import READERS
+from ballu_mjx.residuals.aerodynamics_fit import AirConfig
 from ballu_mjx.residuals.dataset import RecordingsData
 from ballu_mjx.residuals.envmimic import EnvMimicConfig
 from ballu_mjx.residuals.fluid_fit import FluidConfig
@@ -107,7 +108,7 @@ def test_traceback_of_an_input_error_is_shown_with_debug(line: str, capsys: pyte
     [
         ("train supervised", ("--force-shares", "--forces", "--robot", "--actuators")),
         ("train analytic", ("--relinearizations", "--forces", "--robot")),
-        ("train aerodynamic", ("--fixed-from", "--free", "--robot")),
+        ("train aerodynamic", ("--fixed-from", "--free", "--contact-friction", "--robot")),
         ("train fluid", ("--fixed-from", "--terms", "--robot")),
         ("train walk", ("--keep-every", "--robot", "--residual", "--domain-randomization")),
         ("train sysid", ("--levels", "--robot", "--objective")),
@@ -118,6 +119,23 @@ def test_help_of_each_training_lists_its_options(line: str, options: tuple, caps
         main(f"{line} --help")
     output = capsys.readouterr().out
     assert all(option in output for option in options)
+
+
+@pytest.mark.parametrize(
+    ("line", "friction"),
+    [("", 0), ("--contact-friction", 1), ("--free lift friction --contact-friction", 1), ("--free lift", 0)],
+)
+def test_the_friction_of_contacts_is_identified_on_request(line: str, friction: int):
+    asked = []
+
+    def keep(data: train_aerodynamics.AirData, fit: AirConfig) -> int:
+        asked.append(data.identified())
+        return 0
+
+    command = dataclasses.replace(train_aerodynamics.COMMAND, run=keep)
+    run_command({"aerodynamic": command}, ["aerodynamic", *line.split()], "")
+    assert asked[0].count("friction") == friction
+    assert asked[0].count("lift") == 1
 
 
 @pytest.mark.parametrize(

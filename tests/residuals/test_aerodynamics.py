@@ -234,7 +234,7 @@ def slippery_motions() -> list[Motion]:
 
 @pytest.fixture(scope="module")
 def found(motions: list[Motion]) -> AirFit:
-    return identify_air(SIMULATOR, motions, CONFIG)
+    return identify_air(SIMULATOR, motions, CONFIG, free=AIR_PARAMETERS)
 
 
 def test_fit_recovers_known_air_from_another_simulator(found: AirFit):
@@ -257,7 +257,7 @@ def test_fit_recovers_known_air_from_another_simulator(found: AirFit):
 def test_fits_from_different_starting_values_agree(motions: list[Motion], found: AirFit):
     """Delay and added mass have similar effects, so a search could stop at a wrong combination."""
     began = dataclasses.replace(jax.tree.map(lambda x: x / 2, AIR), delay=jnp.array(0.1))
-    again = identify_air(SIMULATOR, motions, CONFIG, fixed_from=began).parameters
+    again = identify_air(SIMULATOR, motions, CONFIG, fixed_from=began, free=AIR_PARAMETERS).parameters
     assert float(again.delay) == pytest.approx(float(found.parameters.delay))
     little = 0.25 * float(found.standard_errors.added_mass)
     assert float(again.added_mass) == pytest.approx(float(found.parameters.added_mass), abs=little)
@@ -274,7 +274,7 @@ def test_lift_can_be_fitted_with_all_other_parameters_fixed(motions: list[Motion
 
 
 def test_friction_is_found_together_with_the_air(slippery_motions: list[Motion]):
-    fit = identify_air(SIMULATOR, slippery_motions, CONFIG)
+    fit = identify_air(SIMULATOR, slippery_motions, CONFIG, free=AIR_PARAMETERS)
     got, errors = fit.parameters, fit.standard_errors
     assert float(got.friction) == pytest.approx(-0.3, abs=0.051)
     assert float(got.delay) == pytest.approx(0.05, abs=1e-6)
