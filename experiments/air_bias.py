@@ -4,7 +4,7 @@
 # The air is identified with a model whose legs have neither dry friction nor backlash. The robot's legs have both. The
 # cables' slack is identified. Here, the training gaits of the bundled robot are recorded again on robots without one
 # or both of these effects. The air is identified from each set of recordings, and compared with the true values, which
-# are the same for all robots. For the robot with all effects, a second table has all seventeen parameters.
+# are the same for all robots. For the robot with all effects, a second table has all sixteen parameters.
 #
 # `python experiments/air_bias.py` takes about ten minutes on one core. `--quick` uses three gaits of two robots.
 
