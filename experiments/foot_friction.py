@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import sys
 from pathlib import Path
+from typing import Any, NamedTuple
 
 sys.path += ["experiments", "benchmarks"]  # a notebook runs in the repository's root
 
@@ -91,20 +92,49 @@ def measure(
     ]
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description="Measure what the identified friction of the feet contributes.")
-    parser.add_argument("--own", type=int, nargs="*", default=[1, 2], help="seeds of robots of the own family (1 2)")
-    parser.add_argument("--bullet", type=int, nargs="*", default=[0, 1, 2], help="seeds of PyBullet's robots (0 1 2)")
-    parser.add_argument("--fresh", type=int, default=2026, help="seed of the test recordings")
-    parser.add_argument("--quick", action="store_true", help="one robot, for a minute; the numbers mean nothing")
+class Chosen(NamedTuple):
+    """Robot of the experiment."""
+
+    name: str
+    hardware: Hardware
+    friction: tuple[float, float]
+    """Coefficients of friction of its feet (left, right)."""
+    folder: Path
+    """Folder of its stages."""
+
+
+def parse(
+    parser: argparse.ArgumentParser, own: list[int], bullet: list[int]
+) -> tuple[argparse.Namespace, list[Chosen]]:
+    """Add the options of this experiment to a parser, parse the command line, and return options and robots.
+
+    `own` and `bullet` are the default seeds of robots. Under `--quick` there is one robot.
+    """
+
+    def seeds(family: str, default: list[int]) -> dict[str, Any]:
+        shown = " ".join(map(str, default)) or "none"
+        return {"type": int, "nargs": "*", "default": default, "help": f"seeds of {family} ({shown})"}
+
+    parser.add_argument("--own", **seeds("robots of the own family", own))
+    parser.add_argument("--bullet", **seeds("PyBullet's robots", bullet))
+    parser.add_argument("--fresh", type=int, default=2026, help="seed of the test recordings of the fits")
+    parser.add_argument("--quick", action="store_true", help="one robot, for minutes; the numbers mean nothing")
     parser.add_argument("--results", type=Path, help="JSON file to write the table to")
     options = _setup.parse(parser, Path("runs/foot-friction"))
     _setup.reserve(options.output, fresh=options.fresh, quick=options.quick)
-    chosen = robots(options.own[:1], []) if options.quick else robots(options.own, options.bullet)
+    drawn = robots(options.own[:1] or [1], []) if options.quick else robots(options.own, options.bullet)
+    return options, [
+        Chosen(name, hardware, friction, options.output / name.replace(" ", "-").lower())
+        for name, (hardware, friction) in drawn.items()
+    ]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Measure what the identified friction of the feet contributes.")
+    options, chosen = parse(parser, [1, 2], [0, 1, 2])
     rows = []
-    for name, (hardware, friction) in chosen.items():
-        folder = options.output / name.replace(" ", "-").lower()
-        rows += measure(name, hardware, friction, options.fresh, folder, options.quick)
+    for robot in chosen:
+        rows += measure(robot.name, robot.hardware, robot.friction, options.fresh, robot.folder, options.quick)
     heads = (f"{group}: {called}" for group in ("near", "far") for called in ("position", "yaw"))
     columns = ("robot", f"{HORIZON:g} s", *heads, "friction in the simulator", "friction of the robot")
     seeds = {"own_robot": options.own, "pybullet_robot": options.bullet, "recording": [options.fresh]}

@@ -12,7 +12,6 @@
 from __future__ import annotations
 
 import argparse
-import functools
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,103 +22,71 @@ import _setup
 
 _setup.prepare()
 
-import dataclasses
-
 import fidelity
 import foot_friction
 import numpy as np
+from final_tier import Figure
 
 from ballu_mjx.ballu.virtual.hardware import Hardware
-from ballu_mjx.ballu.virtual.trials import run_trials
-from ballu_mjx.cli import train_policy
-from ballu_mjx.cli.cached_stages import cached_stage
+from ballu_mjx.cli import pipeline, train_policy
 from ballu_mjx.common.results import Cell, Table
-from ballu_mjx.evaluation import transfer
 from ballu_mjx.evaluation.transfer import Transfer
 from ballu_mjx.policies.locomotion_config import LocomotionConfig
-from ballu_mjx.policies.policy import Policy
-from ballu_mjx.policies.tasks import TASKS
 from ballu_mjx.policies.training import locomotion_ppo
-from ballu_mjx.runs.checkpoints import list_checkpoints
 
-STEPS = 3_000_000
-"""Number of control steps of each training, as in `train all`."""
+WHOLE = pipeline.Options()
+"""Number of control steps of each training, and of trials of each policy: those of `train all`."""
 FIRST_TRIAL = 5000
 """Number of the first trial. Recordings have other numbers, and so other draughts."""
-COLUMNS = ("mean CoM error (m)", "x-distance (m)", "x-distance in its simulator (m)", "final yaw error (deg)")
+FIGURES = (
+    Figure("mean CoM error (m)", lambda t: t.com_error),
+    Figure("x-distance (m)", lambda t: t.x_distance),
+    Figure("x-distance in its simulator (m)", lambda t: t.sim_x_distance),
+    Figure("final yaw error (deg)", lambda t: abs(t.yaw_error), ".0f"),
+)
+"""Columns of the table. Values are means over trials."""
 
 # %% [markdown]
 # ## Measurement
 
 
 # %%
-def trials_of(
-    hardware: Hardware, method: str, residual: Path, seed: int, folder: Path, trials: int, quick: bool
-) -> list[Transfer]:
+def trials_of(hardware: Hardware, method: str, residual: Path, seed: int, folder: Path, quick: bool) -> list[Transfer]:
     """Train a policy in the simulator with a residual, and return its trials on the robot. Finished stages are kept."""
-    env = LocomotionConfig(domain_randomization=True)
-    ppo = locomotion_ppo(seed=seed, **train_policy.QUICK if quick else {"num_timesteps": STEPS})
-    options = {"method": method, "env": dataclasses.asdict(env), "ppo": dataclasses.asdict(ppo)}
-    name = f"{method}-{seed}"
-
-    def train(where: Path) -> None:
-        started = bool(list_checkpoints(where))
-        data = train_policy.Data(resume=where) if started else train_policy.Data(output=where, residual=residual)
-        train_policy.train(TASKS["walk"], data, env, ppo)
-
-    policy = cached_stage(folder / f"walk-{name}", options, [], train)
-
-    def run(where: Path) -> None:
-        numbers = range(FIRST_TRIAL, FIRST_TRIAL + trials)
-        tell = functools.partial(print, flush=True)
-        transfer.write_transfer(
-            where / "transfer.json", run_trials(Policy.load(policy), hardware, numbers, where, tell=tell)
-        )
-
-    done = cached_stage(folder / f"trials-{name}", {"trials": trials}, [policy], run)
-    return transfer.read_transfer(done / "transfer.json")
+    config = LocomotionConfig(domain_randomization=True)
+    ppo = locomotion_ppo(seed=seed, **train_policy.QUICK if quick else {"num_timesteps": WHOLE.policy_steps})
+    trials = 1 if quick else WHOLE.trials
+    data = train_policy.Data(residual=residual)
+    policy = pipeline.train_stage(folder / f"walk-{method}-{seed}", [], "walk", data, config, ppo)
+    numbers = range(FIRST_TRIAL, FIRST_TRIAL + trials)
+    return pipeline.trials_stage(folder / f"trials-{method}-{seed}", policy, hardware, numbers, {"trials": trials})
 
 
 def row(name: str, method: str, found: Sequence[Sequence[Transfer]]) -> tuple[str | Cell, ...]:
-    """Return the row of a robot and method, given the trials of each seed. A value is the mean over a seed's trials."""
-
-    def cell(values: Sequence[Sequence[float]], form: str = ".2f") -> Cell:
-        return Cell(tuple(float(np.mean(each)) for each in values), form)
-
-    return (
-        name,
-        fidelity.METHODS[method].label,
-        cell([[trial.com_error for trial in each] for each in found]),
-        cell([[trial.x_distance for trial in each] for each in found]),
-        cell([[trial.sim_x_distance for trial in each] for each in found]),
-        cell([[abs(trial.yaw_error) for trial in each] for each in found], ".0f"),
+    """Return the row of a robot and method, given the trials of each seed."""
+    cells = (
+        Cell(tuple(float(np.mean([figure.of(trial) for trial in trials])) for trials in found), figure.form)
+        for figure in FIGURES
     )
+    return (name, fidelity.METHODS[method].label, *cells)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Measure what identified friction contributes to walking policies.")
-    parser.add_argument("--own", type=int, nargs="*", default=[], help="seeds of robots of the own family (none)")
-    parser.add_argument("--bullet", type=int, nargs="*", default=[1, 2], help="seeds of PyBullet's robots (1 2)")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="seeds of the trainings (0 1 2)")
-    parser.add_argument("--fresh", type=int, default=2026, help="seed of the test recordings of the fits")
-    parser.add_argument("--quick", action="store_true", help="one robot, for minutes; the numbers mean nothing")
-    parser.add_argument("--results", type=Path, help="JSON file to write the table to")
-    options = _setup.parse(parser, Path("runs/foot-friction"))
-    _setup.reserve(options.output, fresh=options.fresh, quick=options.quick)
-    chosen = foot_friction.robots([1], []) if options.quick else foot_friction.robots(options.own, options.bullet)
-    seeds, trials = (options.seeds[:1], 1) if options.quick else (options.seeds, 5)
+    options, chosen = foot_friction.parse(parser, [], [1, 2])
+    seeds = options.seeds[:1] if options.quick else options.seeds
     rows = []
-    for name, (hardware, _) in chosen.items():
-        folder = options.output / name.replace(" ", "-").lower()
-        _, residuals = foot_friction.fits(hardware, options.fresh, folder, options.quick)
-        for method in foot_friction.METHODS:
+    for robot in chosen:
+        _, residuals = foot_friction.fits(robot.hardware, options.fresh, robot.folder, options.quick)
+        for method, folders in residuals.items():
             made = [
-                trials_of(hardware, method, residuals[method][0], seed, folder / "policies", trials, options.quick)
+                trials_of(robot.hardware, method, folders[0], seed, robot.folder / "policies", options.quick)
                 for seed in seeds
             ]
-            rows.append(row(name, method, made))
+            rows.append(row(robot.name, method, made))
     used = {"own_robot": options.own, "pybullet_robot": options.bullet, "training": seeds}
-    tables = {"walking": Table(("robot", "simulator", *COLUMNS), tuple(rows))}
+    tables = {"walking": Table(("robot", "simulator", *(figure.title for figure in FIGURES)), tuple(rows))}
     _setup.write_tables(tables, options.output, options.results, used)
 
 

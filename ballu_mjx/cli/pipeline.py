@@ -22,7 +22,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -250,16 +250,7 @@ class PipelineStages:
         elif variant.identified:
             needs = [self.identified()]
             data = dataclasses.replace(data, actuators=needs[0] / ACTUATORS_FILE)
-
-        def make(folder: Path) -> None:
-            started = list_checkpoints(folder)
-            if started and is_finished(folder, started[-1], ppo):  # resumed by `train TASK --resume`
-                return
-            where = train_policy.Data(resume=folder, keep_every=data.keep_every, wandb=data.wandb)
-            where = where if started else dataclasses.replace(data, output=folder)
-            train_policy.train(TASKS[task], where, config, ppo)
-
-        return cached_stage(self._own / f"{task}-{setting}", (config, ppo), needs, make)
+        return train_stage(self._own / f"{task}-{setting}", needs, task, data, config, ppo)
 
     def recordings(self, task: str) -> Path:
         """Return the folder of recordings of the robot under the actions of vanilla policies, replayed open loop.
@@ -415,16 +406,9 @@ class PipelineStages:
         """Return the trials of a policy on the robot, each compared with the same policy in its own simulator."""
         source = self.policy(task, setting)
         count = self.options.trials
-
-        def make(folder: Path) -> None:
-            policy = Policy.load(source)
-            numbers = [_draw(self.seed, task, "trials", number) for number in range(count)]
-            found = run_trials(policy, self._robot, numbers, folder, tell=functools.partial(print, flush=True))
-            transfer.write_transfer(folder / "transfer.json", found)
-
+        numbers = [_draw(self.seed, task, "trials", number) for number in range(count)]
         options = {"robot": self._robot.name, "seed": self.seed, "trials": count}
-        folder = cached_stage(self._own / f"trials-{task}-{setting}", options, [source], make)
-        return transfer.read_transfer(folder / "transfer.json")
+        return trials_stage(self._own / f"trials-{task}-{setting}", source, self._robot, numbers, options)
 
     def _actions(self, run: Path, seconds: float) -> list[np.ndarray]:
         """Return the commands of each kept checkpoint of a policy, over `seconds` in its own simulator, from standing.
@@ -435,6 +419,41 @@ class PipelineStages:
         loop = policies[0].closed_loop()
         start, count = loop.standing(), round(seconds / CONTROL_TIMESTEP)
         return [np.round(loop(p.params, *start, count).command[0], 3).astype(float) for p in policies]
+
+
+def train_stage(
+    folder: Path, needs: Sequence[Path], task: str, data: train_policy.Data, config: LocomotionConfig, ppo: PPOConfig
+) -> Path:
+    """Return the run folder of a policy, and train it unless the stage is finished. An interrupted training resumes.
+
+    `needs` are the stages on which it depends, and `data` its simulator.
+    """
+
+    def make(folder: Path) -> None:
+        started = list_checkpoints(folder)
+        if started and is_finished(folder, started[-1], ppo):  # resumed by `train TASK --resume`
+            return
+        where = train_policy.Data(resume=folder, keep_every=data.keep_every, wandb=data.wandb)
+        where = where if started else dataclasses.replace(data, output=folder)
+        train_policy.train(TASKS[task], where, config, ppo)
+
+    return cached_stage(folder, (config, ppo), needs, make)
+
+
+def trials_stage(
+    folder: Path, source: Path, hardware: Hardware, numbers: Sequence[int], options: Mapping[str, Any]
+) -> list[Transfer]:
+    """Return the trials of the policy in the stage `source` on a robot, and run them unless the stage is finished.
+
+    `numbers` are those of the trials for `Hardware.record`, and `options` what determines them, for the stage's key.
+    """
+
+    def make(folder: Path) -> None:
+        found = run_trials(Policy.load(source), hardware, numbers, folder, tell=functools.partial(print, flush=True))
+        transfer.write_transfer(folder / "transfer.json", found)
+
+    made = cached_stage(folder, dict(options), [source], make)
+    return transfer.read_transfer(made / "transfer.json")
 
 
 def _last_steps(run: Path) -> list[int]:
