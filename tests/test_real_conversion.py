@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
 
+import mujoco
 import numpy as np
 import pytest
 import scipy.io
@@ -234,3 +235,38 @@ def test_public_files_become_the_recordings_that_others_made_of_them(
         made, known = (walker.read_walk(data, walk) for data in (folder, REAL_DATA / "compass_gait" / "recordings"))
         for column in walker.COLUMNS:
             np.testing.assert_allclose(made[column], known[column], atol=1e-4)
+
+
+@needs_real_data
+@pytest.mark.parametrize("leg", ["inner", "outer"])
+def test_a_leg_swings_as_in_its_motor_test(walker: ModuleType, leg: str):
+    test = walker.read_motor_test(
+        REAL_DATA / "raw" / "compass_gait" / Path(walker.MOTOR_TESTS.format(leg=leg)).name, leg
+    )
+    recorded = test.joint_angles["swing"]
+    model = walker.model_of_motor_test(leg)
+    model.joint("swing").frictionloss = walker.PUBLISHED["hip_frictionloss"]
+    model.joint("swing").damping = walker.PUBLISHED["hip_damping"]
+    every = round((test.time[1] - test.time[0]) / model.opt.timestep)
+    data = mujoco.MjData(model)
+    data.qpos[1] = recorded[0]
+    angles = []
+    for command in test.command[: round(13 / 0.005), 0]:  # it falls, comes to rest, and is held by 5 V from 9 s on
+        angles.append(data.qpos.copy())
+        data.ctrl[0] = command
+        mujoco.mj_step(model, data, nstep=every)
+    stance, swing = np.rad2deg(angles).T
+    errors = swing - np.rad2deg(recorded[: len(swing)])
+    assert np.sqrt(np.mean(errors[:800] ** 2)) < 5.0  # it falls from 90 deg; without friction, the error is 60 deg
+    assert abs(errors[-1]) < 2.0 < swing[-1]
+    assert np.abs(stance).max() < 0.01
+
+
+@needs_real_data
+def test_a_clone_without_the_motor_tests_is_refused(walker: ModuleType, tmp_path: Path):
+    assert walker.load_motor_tests(REAL_DATA / "compass_gait" / "recordings") == []  # a folder of tables
+    public = tmp_path / walker.PUBLIC
+    public.parent.mkdir(parents=True)
+    public.symlink_to(REAL_DATA / "raw" / "compass_gait" / public.name)
+    with pytest.raises(InputError, match="innerSW.mat"):
+        walker.load_motor_tests(tmp_path)

@@ -7,7 +7,8 @@
 # `System Identification/SysID_Experiment 2/SysID_data_12exp_120steps.mat`. They are joined there end to end.
 #
 # `--data` is a clone of that repository, or a folder with tables of the walks (`walk-00.csv.gz` to `walk-11.csv.gz`).
-# Tables are sampled at 200 Hz, and have these columns:
+# A folder of tables has no motor tests (below), so that the fit then uses the walks alone. Tables are sampled at
+# 200 Hz, and have these columns:
 #
 # | column | public file |
 # | --- | --- |
@@ -24,7 +25,10 @@
 # The authors' script calls the first 3884 samples, which are walks 0 to 2, "3VC, 1 ctrl strategy": three virtual
 # constraints under one controller. We conclude that three walks in a row share a controller, four in all. Walks 0 to 2
 # are the far test: training has no walk of their controller. Five other walks are for training. Two are for validation:
-# they chose the declared parameters and the filters. Two are the near test.
+# they chose the declared parameters, the filters and the use of the motor tests. Two are the near test.
+#
+# Training also has both motor tests, in `System Identification/SysID_Experiment 1`. There the hip is held, and one leg
+# hangs from it. It swings from 90 deg, then under steps of 5 V, then under a chirp of 2 V.
 #
 # Run `python experiments/real/compass_gait/compass_gait.py --data FOLDER`. `--quick` is a short trial run.
 
@@ -63,6 +67,8 @@ VALIDATION = (3, 9)
 TEST = {"near": (5, 7), "far": (0, 1, 2)}
 PUBLIC = "System Identification/SysID_Experiment 2/SysID_data_12exp_120steps.mat"
 """Public file of the walks."""
+MOTOR_TESTS = "System Identification/SysID_Experiment 1/realVSmodel_fwAnd5vstepsx3AndChirp_{leg}SW.mat"
+"""Public file of the motor test with a leg, "inner" or "outer"."""
 WALKS, STEPS = 12, 10
 """Number of walks in the public file, and of steps in a walk."""
 COLUMNS = ("time", "command_motor", "command_inner", "inner", "outer")
@@ -78,6 +84,8 @@ LEGS = {"inner": (0.0448, 0.002919), "outer": (0.0502, 0.002605)}
 """Distance of a leg's centre of mass from the hip (m), and moment of inertia about this centre (kg m^2)."""
 LENGTH = 0.2778
 """Length of a leg (m)."""
+HELD = 1e4
+"""Armature of the stance leg's joint that holds the hip in a motor test (kg m^2)."""
 PUBLISHED = {"hip_frictionloss": 0.0061, "hip_damping": 0.00156}
 """Friction of the data's authors."""
 
@@ -86,10 +94,23 @@ def model_of(stance: str) -> mujoco.MjModel:
     """Return the model of a step in which a leg stands: "inner" or "outer"."""
     spec = mujoco.MjSpec.from_file(str(FOLDER / "compass_gait.xml"))
     swing = next(leg for leg in LEGS if leg != stance)
-    for name, leg, hip in (("stance", stance, LENGTH), ("swing", swing, 0.0)):
-        centre, inertia = LEGS[leg]
-        spec.body(name).ipos = [0, 0, hip - centre]
-        spec.body(name).inertia = [inertia, inertia, 0.0005]
+    place_leg(spec, "stance", stance)
+    place_leg(spec, "swing", swing)
+    return spec.compile()
+
+
+def place_leg(spec: mujoco.MjSpec, body: str, leg: str) -> None:
+    """Give the body "stance" or "swing" the inertia of a leg, "inner" or "outer"."""
+    centre, inertia = LEGS[leg]
+    spec.body(body).ipos = [0, 0, (LENGTH if body == "stance" else 0.0) - centre]
+    spec.body(body).inertia = [inertia, inertia, 0.0005]
+
+
+def model_of_motor_test(leg: str) -> mujoco.MjModel:
+    """Return the model of the motor test with a leg: the leg swings, and the other leg and the hip do not move."""
+    spec = mujoco.MjSpec.from_file(str(FOLDER / "compass_gait.xml"))
+    place_leg(spec, "swing", leg)
+    spec.joint("stance").armature = HELD
     return spec.compile()
 
 
@@ -113,12 +134,7 @@ def convert(path: Path, walk: int) -> dict[str, np.ndarray]:
 
     **Raises** `InputError` if a variable is missing or has another length, or if the walks do not have `STEPS` each.
     """
-    try:
-        held = scipy.io.loadmat(path)
-        variables = [held[name].ravel() for name in ("datatime", "hipangle", "innoutst", "stanceangle", "umaxonsatu")]
-        table = np.stack(variables).astype(float)
-    except (KeyError, ValueError, NotImplementedError) as error:
-        raise InputError(f"{path}: a variable is missing or damaged ({error}); download the file again.") from error
+    table = read_variables(path, ("datatime", "hipangle", "innoutst", "stanceangle", "umaxonsatu"))
     begins = np.r_[0, np.flatnonzero(np.diff(table[2] > 0.5)) + 1, table.shape[1]]
     if len(begins) != WALKS * STEPS + 1:
         raise InputError(
@@ -128,6 +144,34 @@ def convert(path: Path, walk: int) -> dict[str, np.ndarray]:
     hip = np.deg2rad(hip)
     inner = np.where(outer_stands > 0.5, hip - stance, -stance)
     return dict(zip(COLUMNS, (time - time[0], voltage / 20 + 0.5, outer_stands, inner, -hip), strict=True))
+
+
+def read_variables(path: Path, names: Sequence[str]) -> np.ndarray:
+    """Return variables of a public file as rows, in the order of `names`.
+
+    **Raises** `InputError` if one is missing, or if they have different lengths.
+    """
+    try:
+        variables = scipy.io.loadmat(path, variable_names=names)
+        return np.stack([variables[name].ravel() for name in names]).astype(float)
+    except (KeyError, ValueError, NotImplementedError) as error:
+        raise InputError(f"{path}: a variable is missing or damaged ({error}); download the file again.") from error
+
+
+def read_motor_test(path: Path, leg: str) -> Recording:
+    """Return the motor test with a leg from its public file.
+
+    **Raises** `InputError` from `read_variables`.
+    """
+    time, voltage, angle = read_variables(path, ("datatimeall", "datainall", "dataoutall"))
+    return Recording(
+        name=f"motor test of the {leg} leg",
+        kind="suspended",
+        robot="Sydney compass gait",
+        time=time,
+        command=(voltage / 20 + 0.5)[:, None],
+        joint_angles={"stance": np.zeros_like(angle), "swing": np.deg2rad(angle)},
+    )
 
 
 def cut_steps(table: Mapping[str, np.ndarray], name: str) -> list[tuple[str, Recording]]:
@@ -166,6 +210,23 @@ def load(data: Path, walks: Sequence[int]) -> list[MeasuredMotion]:
     return motions
 
 
+def load_motor_tests(data: Path) -> list[MeasuredMotion]:
+    """Read and measure the motor tests in `data`: one of each leg, or none if `data` has only tables of walks.
+
+    **Raises** `InputError` if `data` has the public walks without the motor tests, and from `read_motor_test`.
+    """
+    if not (data / PUBLIC).is_file():
+        return []
+    robot = read_description(FOLDER / "compass_gait.robot.json")
+    motions = []
+    for leg in LEGS:
+        path = data / MOTOR_TESTS.format(leg=leg)
+        if not path.is_file():
+            raise InputError(f"{path}: file not found; the clone of the public data is incomplete.")
+        motions.append(measure(read_motor_test(path, leg), robot, model_of_motor_test(leg), SAMPLING))
+    return motions
+
+
 def begin_at(motion: MeasuredMotion, sample: int) -> MeasuredMotion:
     """Return a motion without its first samples."""
     return dataclasses.replace(
@@ -182,7 +243,7 @@ def identify(data: Path, *, quick: bool) -> RobotFit:
     robot = read_description(FOLDER / "compass_gait.robot.json")
     parameters = declared_parameters(robot, robot.load_model())
     config = FitConfig(window_seconds=HORIZONS[-1], starts=1 if quick else 2, steps=2 if quick else 15)
-    training = load(data, TRAINING[:1] if quick else TRAINING)
+    training = load(data, TRAINING[:1]) if quick else [*load(data, TRAINING), *load_motor_tests(data)]
     return fit_robot(parameters, training, load(data, VALIDATION), config, _fit.report)
 
 
