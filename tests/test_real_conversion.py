@@ -171,6 +171,17 @@ def test_joined_walks_are_separated(walker: ModuleType, tmp_path: Path):
         walker.read_walk(tmp_path / "elsewhere", 0)
 
 
+def test_methods_are_run_after_those_that_they_need(blimp: ModuleType):
+    assert blimp.with_earlier(["linear fluid, then supervised", "fluid"]) == [
+        "fluid",
+        "linear fluid",
+        "linear fluid, then supervised",
+    ]
+    folders = [method.folder for method in blimp.METHODS.values()]
+    assert len(set(folders)) == len(folders)
+    assert not any(" " in folder for folder in folders)
+
+
 def test_a_flight_is_turned_upright(blimp: ModuleType, tmp_path: Path):
     time = np.arange(90) / 60
     rows = np.zeros((90, len(BLIMP_COLUMNS)))

@@ -44,7 +44,7 @@ _setup.prepare()
 import argparse
 import shutil
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import _public
@@ -105,19 +105,20 @@ class Method(NamedTuple):
     @property
     def folder(self) -> str:
         """Name of the method's runs."""
-        return "-".join((*self.command, *(self.earlier or ()))).replace("--", "")
+        return "-".join((*self.command, *(self.earlier or ()))).replace("--", "").replace(" ", "-")
 
 
 _FADING = ("--fade-width", "1")
 _REGRESSION = ("supervised", "--forces", "wrench", *_FADING)
+_WINDOWS = ("--window-seconds", *map(str, (0.5, 2.0, HORIZONS[-1])), "--windows", "100")
+_SHORT_FIT = ("--terms", "linear", "--window-seconds", "0.5", "--windows", "10", "--steps", "2")
 _SHORT_REGRESSION = ("--updates", "20")
 _SHORT_REINFORCEMENT = ("--num-timesteps", "4000", "--num-envs", "16", "--batch-size", "16", "--num-minibatches", "4")
 METHODS: Mapping[str, Method] = {
-    "fluid": Method(
-        ("fluid", "--window-seconds", *map(str, (0.5, 2.0, HORIZONS[-1])), "--windows", "100"),
-        quick=("--terms", "linear", "--window-seconds", "0.5", "--windows", "10", "--steps", "2"),
-    ),
+    "fluid": Method(("fluid", *_WINDOWS), quick=_SHORT_FIT),
     "fluid, then supervised": Method(_REGRESSION, ("--residual", "fluid"), _SHORT_REGRESSION),
+    "linear fluid": Method(("fluid", "--terms", "linear", *_WINDOWS), quick=_SHORT_FIT),
+    "linear fluid, then supervised": Method(_REGRESSION, ("--residual", "linear fluid"), _SHORT_REGRESSION),
     "supervised": Method(_REGRESSION, quick=_SHORT_REGRESSION),
     "EnvMimic": Method(("envmimic", *_FADING), quick=_SHORT_REINFORCEMENT),
     "EnvMimic from supervised": Method(("envmimic",), ("--start-from", "supervised"), _SHORT_REINFORCEMENT),
@@ -129,8 +130,10 @@ QUICK_METHODS = ("fluid", "EnvMimic")
 """Methods of a trial run."""
 SHORT = ("no air", "published model", "fluid", "fluid, then supervised", "EnvMimic", "nearest moments")
 """Rows of the short table."""
-MEANS = ("published model", "fluid")
+MEANS = ("published model", "published model, symmetric", "fluid", "linear fluid")
 """Methods whose mean yaw errors are listed by thrusts."""
+DRAWN = ("published model", "fluid")
+"""Methods in the figure."""
 TRIMMED = "fluid, trimmed on its group"
 """Row of `trimmed_errors`."""
 SHOWN = 20.0
@@ -192,7 +195,7 @@ def load(paths: Sequence[Path], robot: RobotDescription) -> list[Motion]:
 
 # %%
 class PublishedAerodynamics(Residual):
-    """Residual with the published model. It has no parameters."""
+    """Residual with the published model. Its parameter scales the asymmetric terms. It is 1 in the published model."""
 
     pressure_area = 0.5 * 1.2187 * 0.25
     """Half the air density (kg/m^3) times the reference area (m^2)."""
@@ -213,20 +216,20 @@ class PublishedAerodynamics(Residual):
         return history[-1]
 
     def act(self, params: Any, history: History, commands: Commands, key: Array | None = None) -> Action:
-        del params, commands, key
+        del commands, key
         frame, velocity, rate = body_motion(history, self._control_timestep)
         v, w = FLIP * velocity, FLIP * rate
         speed = jnp.sqrt(jnp.sum(v**2) + 1e-8)
         a, b = jnp.arctan2(v[2], v[0]), jnp.arcsin(jnp.clip(v[1] / speed, -1.0, 1.0))
         size = self.pressure_area * speed**2
         drag = 0.2425 + 4.4195 * a**2 + 7.5080 * b**2
-        side = 0.0083 - 0.0744 * a**2 - 2.1140 * b
+        side = params * (0.0083 - 0.0744 * a**2) - 2.1140 * b
         lift = 0.1594 + 2.9375 * a + 4.5537 * b**2
         moments = jnp.stack(
             [
-                0.0131 - 0.0301 * a - 0.5256 * b,
+                params * (0.0131 - 0.0301 * a) - 0.5256 * b,
                 0.0568 + 0.0933 * a + 5.2357 * b**4,
-                0.0006 - 0.0012 * a - 0.0936 * b,
+                params * (0.0006 - 0.0012 * a) - 0.0936 * b,
             ]
         )
         ca, sa, cb, sb = jnp.cos(a), jnp.sin(a), jnp.cos(b), jnp.sin(b)
@@ -454,6 +457,13 @@ def learn(name: str, files: Mapping[str, Sequence[Path]], output: Path, seed: in
     return TrainedResidual.load(run, read_description(DESCRIPTION))
 
 
+def with_earlier(names: Iterable[str]) -> list[str]:
+    """Return these methods and those that they need, in the order of `METHODS`."""
+    wanted = set(names)
+    wanted |= {method.earlier[1] for name in wanted if (method := METHODS[name]).earlier is not None}
+    return [name for name in METHODS if name in wanted]
+
+
 def _run(output: Path, method: Method, seed: int) -> Path:
     """Return the run of a method. The same fit of *fluid* is that of all seeds."""
     return output / (method.folder if method.kind == "fluid" else f"{method.folder}-{seed}")
@@ -470,6 +480,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Learn the air forces on a real blimp, and predict test flights.")
     parser.add_argument("--data", type=Path, required=True, help="folder with the public files or recordings of them")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="seeds of EnvMimic (0 1 2)")
+    parser.add_argument(
+        "--methods", nargs="+", choices=METHODS, metavar="METHOD", help="methods to run (all): " + "; ".join(METHODS)
+    )
     parser.add_argument("--quick", action="store_true", help="few flights and steps; the numbers mean little")
     parser.add_argument("--results", type=Path, help="JSON file to write the tables to")
     parser.add_argument("--figure", type=Path, help="PNG file for a figure of three test flights")
@@ -484,18 +497,20 @@ def main() -> None:
     motions = {use: load(paths, robot) for use, paths in files.items()}
     training, groups = motions["training"], {group: motions[group] for group in GROUPS}
     simulator = Simulator(robot)
-    methods, seeds = (QUICK_METHODS, options.seeds[:1]) if options.quick else (METHODS, options.seeds)
+    seeds = options.seeds[:1] if options.quick else options.seeds
+    methods = with_earlier(options.methods or (QUICK_METHODS if options.quick else METHODS))
+    published = PublishedAerodynamics(robot.control_timestep)
     residuals: dict[str, list[tuple[Residual, Any]]] = {
-        "published model": [(PublishedAerodynamics(robot.control_timestep), jnp.zeros(0))],
+        "published model": [(published, jnp.ones(()))],
+        "published model, symmetric": [(published, jnp.zeros(()))],
     }
     learned: dict[str, list[TrainedResidual]] = {}
     for name in methods:
         own = seeds[:1] if METHODS[name].kind == "fluid" else seeds
         learned[name] = [learn(name, files, options.output, seed, quick=options.quick) for seed in own]
         residuals[name] = [(each.model, each.params) for each in learned[name]]
-    (fluid,) = learned["fluid"]
     evaluators = Evaluators(simulator)
-    drawn = {name: residuals[name][0] for name in ("published model", "fluid")}
+    drawn = {name: residuals[name][0] for name in DRAWN if name in residuals}
     residuals["constant wrench"] = [fit_constant_wrench(simulator, training)]
     flown = [motion for group in groups.values() for motion in group]  # together, so that one program replays them
     places: dict[str, range] = {}
@@ -516,7 +531,8 @@ def main() -> None:
         if name in MEANS:
             turns = {group: mean_yaw_errors(evaluator, replays[name][0], places[group]) for group in TEST}
             means[name] = {f"{group}, {thrusts}": turn for group in TEST for thrusts, turn in turns[group].items()}
-    if not options.quick:
+    if "fluid" in learned and not options.quick:
+        (fluid,) = learned["fluid"]
         own = {group: places[group] for group in TEST}
         trimmed = trimmed_errors(simulator, fluid, evaluators.of(fluid.model, flown), own)
         rows[TRIMMED] = {group: [found] for group, found in trimmed.items()}
@@ -524,8 +540,8 @@ def main() -> None:
         group: [neighbour_errors(training, flown, robot.control_timestep)] for group, flown in groups.items()
     }
     signed = Table(
-        (f"mean yaw error after {HORIZONS[-1]:g} s (deg)", *MEANS),
-        tuple((flown, *(Cell((means[name][flown],), ".1f") for name in MEANS)) for flown in means[MEANS[0]]),
+        (f"mean yaw error after {HORIZONS[-1]:g} s (deg)", *means),
+        tuple((flown, *(Cell((turns[flown],), ".1f") for turns in means.values())) for flown in means[MEANS[0]]),
     )
     shown = tables(rows) | {"means": signed}
     _setup.write_tables(shown, options.output, options.results, {"training": seeds})
