@@ -11,6 +11,7 @@ import datetime
 import json
 import math
 import re
+import shlex
 import statistics
 import sys
 from collections.abc import Mapping, Sequence
@@ -127,7 +128,9 @@ def _format(value: float, form: str) -> str:
 
 
 def command_line(arguments: Sequence[str] | None = None) -> str:
-    """Return a command line as typed in the repository's root. Absolute paths outside it are cut to the file name.
+    """Return a command line as typed in a shell, in the repository's root.
+
+    Absolute paths outside it are cut to the file name. Arguments with spaces are quoted.
 
     `arguments`: the script and its arguments. None for those of this process.
     """
@@ -139,7 +142,7 @@ def command_line(arguments: Sequence[str] | None = None) -> str:
             path = path.resolve()
             part = str(path.relative_to(_ROOT)) if path.is_relative_to(_ROOT) else path.name
         parts.append(part)
-    return " ".join(["python", *parts])
+    return shlex.join(["python", *parts])
 
 
 def write_results(

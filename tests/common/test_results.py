@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shlex
 from pathlib import Path
 
 import prose  # pyright: ignore[reportMissingImports]  # docs/, on pytest's path
@@ -11,7 +12,7 @@ import pytest
 import render  # pyright: ignore[reportMissingImports]
 
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.common.results import Cell, Table, read_results, write_results
+from ballu_mjx.common.results import Cell, Table, command_line, read_results, write_results
 
 TABLE = Table(("method", "error (m)"), (("one", Cell((0.5, 0.25, 0.75), ".3f")), ("two", Cell((1.0,), ".0f", "m"))))
 MARK = "before\n<!-- results: measured errors -->\n| old |\n<!-- /results -->\nafter\n"
@@ -78,3 +79,8 @@ def test_pages_show_the_tables_of_the_results_files(page: Path):
 def test_every_results_file_is_shown_in_a_page():
     shown = set().union(*(render.rendered_names(page.read_text(encoding="utf-8")) for page in prose.pages()))
     assert {path.stem for path in render.RESULTS.glob("*.json")} - {"final"} == shown
+
+
+def test_a_recorded_command_runs_in_a_shell_with_the_same_arguments():
+    arguments = ["experiments/x.py", "--methods", "fluid, then supervised", "supervised", "--output", "my runs"]
+    assert shlex.split(command_line(arguments)) == ["python", *arguments]
