@@ -262,13 +262,15 @@ def test_a_leg_swings_as_in_its_motor_test(walker: ModuleType, leg: str):
     data = mujoco.MjData(model)
     data.qpos[1] = recorded[0]
     angles = []
-    for command in test.command[: round(13 / 0.005), 0]:  # it falls, comes to rest, and is held by 5 V from 9 s on
+    played = test.time < 13.0  # it falls, comes to rest, and is held by 5 V from 9 s on
+    for command in test.command[played, 0]:
         angles.append(data.qpos.copy())
         data.ctrl[0] = command
         mujoco.mj_step(model, data, nstep=every)
     stance, swing = np.rad2deg(angles).T
-    errors = swing - np.rad2deg(recorded[: len(swing)])
-    assert np.sqrt(np.mean(errors[:800] ** 2)) < 5.0  # it falls from 90 deg; without friction, the error is 60 deg
+    errors = swing - np.rad2deg(recorded[played])
+    fall = errors[test.time[played] < 4.0]
+    assert np.sqrt(np.mean(fall**2)) < 5.0  # it falls from 90 deg; without friction, the error is 60 deg
     assert abs(errors[-1]) < 2.0 < swing[-1]
     assert np.abs(stance).max() < 0.01
 

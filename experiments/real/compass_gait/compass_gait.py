@@ -143,7 +143,12 @@ def convert(path: Path, walk: int) -> dict[str, np.ndarray]:
     time, hip, outer_stands, stance, voltage = table[:, begins[walk * STEPS] : begins[(walk + 1) * STEPS]]
     hip = np.deg2rad(hip)
     inner = np.where(outer_stands > 0.5, hip - stance, -stance)
-    return dict(zip(COLUMNS, (time - time[0], voltage / 20 + 0.5, outer_stands, inner, -hip), strict=True))
+    return dict(zip(COLUMNS, (time - time[0], command_of(voltage), outer_stands, inner, -hip), strict=True))
+
+
+def command_of(voltage: np.ndarray) -> np.ndarray:
+    """Return the command of the motor for a voltage (V). It is 0.5 at 0 V."""
+    return voltage / 20 + 0.5
 
 
 def read_variables(path: Path, names: Sequence[str]) -> np.ndarray:
@@ -169,7 +174,7 @@ def read_motor_test(path: Path, leg: str) -> Recording:
         kind="suspended",
         robot="Sydney compass gait",
         time=time,
-        command=(voltage / 20 + 0.5)[:, None],
+        command=command_of(voltage)[:, None],
         joint_angles={"stance": np.zeros_like(angle), "swing": np.deg2rad(angle)},
     )
 

@@ -21,9 +21,9 @@
 # set are kept for a final check; this script does not read them.
 #
 # `METHODS` lists the methods. Those with networks have several seeds. The baselines are the nominal model without air,
-# the constant wrench that explains the training flights best, the published aerodynamic model, and the mean motion of
-# the nearest recorded moments. Errors are root mean squares of the errors at the end of a horizon, over starts in every
-# second.
+# the constant wrench that explains the training flights best, the published aerodynamic model, with and without its
+# asymmetric terms, and the mean motion of the nearest recorded moments. Errors are root mean squares of the errors at
+# the end of a horizon, over starts in every second.
 #
 # Run `python experiments/real/rgblimp/rgblimp.py --data FOLDER`. `--quick` is a short trial run. Finished runs in
 # `--output` are used again.
