@@ -6,7 +6,7 @@ compared with the nominal ones:
 - settled angles: mean absolute error (deg) of simulated motors and knees, on commands that the fit did not use.
 - free walking: position RMSE (m) of open-loop replays from recorded states over 1 s and 5 s, with the drivetrain
   (`identification.actuator_choice`). Near recordings are of gaits, far ones of other commands.
-- the choice of `--actuators auto`, from the guard's replay of other recordings.
+- the choice of `--actuators auto`, from a replay of other recordings.
 
 Choices in the package were based on robots 0, 1 and 2. All five take about an hour on two cores.
 
@@ -146,7 +146,7 @@ def copy_numbers(full: mujoco.MjModel, held: mujoco.MjModel) -> None:
 
 
 def validation_commands() -> dict[str, Float[np.ndarray, "steps 2"]]:
-    """Return the commands of the guard's recordings, by name."""
+    """Return the commands of the validation recordings, by name."""
     steps = round(SECONDS / load_robot().control_timestep)
     rng = np.random.default_rng(46)
     held = np.repeat(np.round(rng.uniform(size=(steps // 12 + 1, 2)), 4), 12, axis=0)[:steps]
@@ -220,13 +220,13 @@ def examine(seed: int, identify: Callable[[Sweep], Identification]) -> dict[str,
         name: float(np.rad2deg(np.mean(np.abs(settled(held_out, parameters, model) - truth))))
         for name, parameters in (("nominal", None), ("identified", actuators))
     }
-    guard = choose_actuators(load_robot(), actuators, walking(record(seed, validation_commands()), actuators))
+    choice = choose_actuators(load_robot(), actuators, walking(record(seed, validation_commands()), actuators))
     rows = zip(found.fits, SIDES, strict=True)
     result = {
         "robot": dataclasses.asdict(bullet),
         "settled_deg": errors,
         "open_loop_m": open_loop(record(seed, walking_commands(SECONDS)), actuators),
-        "guard": {"ratio": guard.ratio, "takes": "identified" if guard.improves else "nominal"},
+        "choice": {"ratio": choice.ratio, "takes": "identified" if choice.improves else "nominal"},
         "seconds": seconds,
         "parameters": actuators_to_json(actuators),
         **identification_details(found),
@@ -247,7 +247,7 @@ def compared(row: Mapping[str, float], form: str) -> str:
 def table(results: Mapping[int, Mapping[str, Any]]) -> Table:
     """Return a table of errors of nominal and identified actuators, with their ratio in brackets."""
     groups = list(next(iter(results.values()))["open_loop_m"])
-    heads = ("robot", "settled angles (deg)", *(f"{group} (m)" for group in groups), "guard's ratio, and choice")
+    heads = ("robot", "settled angles (deg)", *(f"{group} (m)" for group in groups), "validation ratio, and choice")
     return Table(
         heads,
         tuple(
@@ -255,7 +255,7 @@ def table(results: Mapping[int, Mapping[str, Any]]) -> Table:
                 str(seed),
                 compared(result["settled_deg"], ".2f"),
                 *(compared(result["open_loop_m"][group], ".3f") for group in groups),
-                f"{result['guard']['ratio']:.2f}, {result['guard']['takes']}",
+                f"{result['choice']['ratio']:.2f}, {result['choice']['takes']}",
             )
             for seed, result in results.items()
         ),
@@ -299,7 +299,7 @@ def main() -> None:
         found = true_legs_table(robots)
         print(found.to_markdown())
         if arguments.results is not None:
-            write_results(arguments.results, {"walking": found}, "Made data", seeds={"robot": robots})
+            write_results(arguments.results, {"walking": found}, "Simulated data", seeds={"robot": robots})
         return
     config = IdentificationConfig(motion=not arguments.quick)
     compiled: list[Identifier] = []

@@ -180,7 +180,7 @@ def main() -> None:
     for table in tables.values():
         print(f"\n{table.to_markdown()}")
     if arguments.results is not None:
-        write_results(arguments.results, tables, "Made data", seeds={"robot": robots})
+        write_results(arguments.results, tables, "Simulated data", seeds={"robot": robots})
 
 
 if __name__ == "__main__":

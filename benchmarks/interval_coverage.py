@@ -147,7 +147,7 @@ def main() -> None:
         made = [draw._asdict() for draw in draws]
         write(arguments.output, "coverage", {"noise_deg": NOISE, "friction_deg": arguments.friction, "draws": made})
     if arguments.results:
-        write_results(arguments.results, tables, f"Made data, {arguments.draws} draws from seed 0 on")
+        write_results(arguments.results, tables, f"Simulated data, {arguments.draws} draws from seed 0 on")
 
 
 if __name__ == "__main__":

@@ -309,7 +309,7 @@ def toolbox(
 def table(rows: list[Row]) -> Table:
     """Return the results as a table for `docs/render.py`."""
     heads = (
-        "way",
+        "method",
         "parameters",
         "time (s)",
         "compiling (s)",

@@ -303,7 +303,7 @@ def table(rounds: Sequence[Sequence[Found]], validation: WindowRollouts) -> Tabl
     best = min(row.objective for row in rounds[0])
     shared = max(min(r.objective for r in rounds[0] if r.way == way) for way in {r.way for r in rounds[0]})
     heads = (
-        "way",
+        "method",
         "error at the end",
         "validation: shoulder / elbow after 1 s (deg)",
         "search (s)",

@@ -137,7 +137,7 @@ def main() -> None:
         rows += measure(robot.name, robot.hardware, robot.friction, options.fresh, robot.folder, options.quick)
     heads = (f"{group}: {called}" for group in ("near", "far") for called in ("position", "yaw"))
     columns = ("robot", f"{HORIZON:g} s", *heads, "friction in the simulator", "friction of the robot")
-    seeds = {"own_robot": options.own, "pybullet_robot": options.bullet, "recording": [options.fresh]}
+    seeds = {"own robot": options.own, "PyBullet robot": options.bullet, "recording": [options.fresh]}
     _setup.write_tables({"robots": Table(columns, tuple(rows))}, options.output, options.results, seeds)
 
 

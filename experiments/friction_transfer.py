@@ -85,7 +85,7 @@ def main() -> None:
                 for seed in seeds
             ]
             rows.append(row(robot.name, method, made))
-    used = {"own_robot": options.own, "pybullet_robot": options.bullet, "training": seeds}
+    used = {"own robot": options.own, "PyBullet robot": options.bullet, "training": seeds}
     tables = {"walking": Table(("robot", "simulator", *(figure.title for figure in FIGURES)), tuple(rows))}
     _setup.write_tables(tables, options.output, options.results, used)
 

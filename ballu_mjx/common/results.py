@@ -106,11 +106,11 @@ class Results:
         if self.commit is not None:
             commit = f" at commit {self.commit[:7]}" + (" with changes" if provenance.CHANGED in self.commit else "")
         seeds = "".join(
-            f" {use.capitalize()} {_counted('seed', len(s))}: {', '.join(map(str, s))}."
+            f" {use[:1].upper()}{use[1:]} {_counted('seed', len(s))}: {', '.join(map(str, s))}."
             for use, s in self.seeds.items()
             if s
         )
-        seeds += " One seed on one robot ranks nothing." if len(self.seeds.get("training", (0, 1))) == 1 else ""
+        seeds += " One seed on one robot supports no ranking." if len(self.seeds.get("training", (0, 1))) == 1 else ""
         cores = int(self.machine["cores"])
         machine = f"{cores} {_counted('core', cores)} of {self.machine['cpu']}"
         return f"{self.data}. `{self.command}`{commit}, {machine}.{seeds}"

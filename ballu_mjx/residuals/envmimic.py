@@ -60,7 +60,7 @@ class EnvMimicConfig(ForceNetworkConfig):
     orientation_axes: tuple[float, float, float] = (0.2, 0.4, 0.4)
     """Weights of roll, pitch and yaw in the orientation error, the diagonal of the paper's W (paper: 0.2, 0.4, 0.4)."""
     fine_position_weight: float = 0.3
-    """Weight of an additional, sharper position term. The paper's position term is still 0.97 at an error of 5 cm, so
+    """Weight of an additional, sharper position term. The paper's position term is still 0.98 at an error of 5 cm, so
     it hardly rewards a good force within a second or two. With both fine weights 0, the reward is the paper's."""
     fine_orientation_weight: float = 1.0
     """Weight of an additional, sharper orientation term."""
