@@ -270,6 +270,10 @@ def true_legs_table(robots: Sequence[int]) -> Table:
     return Table(("robot", *(f"{group} (m)" for group in groups)), made)
 
 
+OUTPUT = Path("runs/bench-bullet_identification")
+"""Default folder of the results."""
+
+
 def read_earlier(path: Path, robots: Sequence[int], commit: str) -> dict[str, Any]:
     """Return the results of an interrupted run, to continue it. They are empty if there is none.
 
@@ -279,8 +283,11 @@ def read_earlier(path: Path, robots: Sequence[int], commit: str) -> dict[str, An
         return {"commit": commit, "robots": {}}
     earlier = json.loads(path.read_text(encoding="utf-8"))
     earlier["robots"] = {int(seed): result for seed, result in earlier["robots"].items()}
-    if earlier["commit"] != commit and not set(robots) <= set(earlier["robots"]):
-        raise InputError(f"{path} is of commit {earlier['commit']}, but this is {commit}; give an empty folder.")
+    changed = earlier["commit"] != commit or provenance.CHANGED in commit
+    if changed and not set(robots) <= set(earlier["robots"]):
+        raise InputError(
+            f"{path} is of commit {earlier['commit']}, and this is {commit}; give an empty folder, or commit changes."
+        )
     return earlier
 
 
@@ -289,9 +296,7 @@ def main() -> None:
     parser.add_argument("--robots", type=int, nargs="+", default=None, choices=list(ROBOTS), help="seeds (all)")
     parser.add_argument("--quick", action="store_true", help="one robot, fitted to settled angles only")
     parser.add_argument("--true-legs", action="store_true", help="use the true legs instead of identifying them")
-    parser.add_argument(
-        "--output", type=Path, default=Path("runs/bench-bullet_identification"), help="folder for the results"
-    )
+    parser.add_argument("--output", type=Path, help=f"folder for the results ({OUTPUT}, with -quick under --quick)")
     parser.add_argument("--results", type=Path, help="JSON file to write the table to")
     arguments = parser.parse_args()
     robots = arguments.robots or (CHOSEN_ON[:1] if arguments.quick else list(ROBOTS))
@@ -310,12 +315,13 @@ def main() -> None:
                 compiled.append(Identifier(config, sweep, silent))
             return compiled[0].run(sweep, silent)
 
-    path = arguments.output / "bullet_identification.json"
+    output = arguments.output or (OUTPUT.with_name(f"{OUTPUT.name}-quick") if arguments.quick else OUTPUT)
+    path = output / "bullet_identification.json"
     earlier = read_earlier(path, robots, provenance.source_commit() or "")
     for seed in robots:
         if seed not in earlier["robots"]:
             earlier["robots"][seed] = examine(seed, identify)
-            write(arguments.output, "bullet_identification", {key: earlier[key] for key in ("commit", "robots")})
+            write(output, "bullet_identification", {key: earlier[key] for key in ("commit", "robots")})
     found = table({seed: earlier["robots"][seed] for seed in robots})
     stored = json.loads(path.read_text(encoding="utf-8"))
     print(f"\n{described(stored['machine'])}; commit {stored['commit']}\n{found.to_markdown()}")

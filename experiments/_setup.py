@@ -34,12 +34,16 @@ def prepare() -> None:
 def parse(parser: argparse.ArgumentParser, output: Path, arguments: Sequence[str] | None = None) -> argparse.Namespace:
     """Add the option `--output` to a parser that has `--quick`, and parse the command line, or `arguments`.
 
-    The default of `--output` is the folder `output`. With `--quick` it is a folder beside it, because finished
-    trainings are not repeated: a full run in the same folder would take those of the quick run.
+    A list with an entry twice is an error. The default of `--output` is the folder `output`. With `--quick` it is a
+    folder beside it, because finished trainings are not repeated: a full run in the same folder would take those of the
+    quick run.
     """
     quick = output.with_name(f"{output.name}-quick")
     parser.add_argument("--output", type=Path, help=f"folder of all results ({output}, or {quick} under --quick)")
     options = parser.parse_args(arguments)
+    for name, given in vars(options).items():
+        if isinstance(given, list) and len(set(given)) < len(given):
+            parser.error(f"--{name.replace('_', '-')} has an entry twice; a repetition is no other sample.")
     if options.output is None:
         options.output = quick if options.quick else output
     return options

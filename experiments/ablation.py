@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import hashlib
 import json
 import sys
 import time
@@ -31,6 +32,7 @@ import jax
 from ballu_mjx.ballu.actuators_file import read_actuators
 from ballu_mjx.ballu.virtual import dataset
 from ballu_mjx.ballu.virtual.hardware import VirtualHardware
+from ballu_mjx.common import files
 from ballu_mjx.common.results import Cell, Table
 from ballu_mjx.evaluation.errors import SCORE_HORIZONS
 from ballu_mjx.evaluation.open_loop import OpenLoopEvaluator
@@ -58,6 +60,11 @@ class Row:
 
     env: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     ppo: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    @property
+    def key(self) -> str:
+        """Hash of the options, for the names of files."""
+        return hashlib.sha256(json.dumps(dataclasses.asdict(self), sort_keys=True).encode()).hexdigest()[:10]
 
 
 PAPER = preset_values("paper")
@@ -190,11 +197,11 @@ def main() -> None:
     results: dict[str, list[list[dict[str, Any]]]] = {}
     for seed in seeds:
         for label in rows:
-            path = options.output / f"{list(ROWS).index(label):02d}-seed-{seed}.json"
+            path = options.output / f"{ROWS[label].key}-seed-{seed}.json"
             if not path.exists():
                 started = time.perf_counter()
                 history = train(ROWS[label], seed, sizes, simulator, motions)
-                path.write_text(json.dumps({"row": label, "seed": seed, "validations": history}, indent=1) + "\n")
+                files.write(path, json.dumps({"row": label, "seed": seed, "validations": history}, indent=1) + "\n")
                 jax.clear_caches()  # the programs of a dozen trainings exceed the process's limit of memory maps
                 seconds = time.perf_counter() - started
                 print(f"{label}, seed {seed}: {history[-1]['score']:.2f} ({seconds:.0f} s)", flush=True)

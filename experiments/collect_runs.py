@@ -40,8 +40,14 @@ _FORMS = {"position": (".3f", "m"), "orientation": (".1f", "deg")}
 
 # %%
 def seed_of(config: dict[str, Any]) -> int:
-    """Return the training seed of a run, given its configuration."""
-    return int(next(config[name]["seed"] for name in ("ppo", "fit") if "seed" in config.get(name, {})))
+    """Return the training seed of a run, given its configuration.
+
+    **Raises** `InputError` if the run has none.
+    """
+    for name in ("ppo", "fit"):
+        if "seed" in config.get(name, {}):
+            return int(config[name]["seed"])
+    raise InputError(f"A run of {config['task']} has no seed; give runs of a method that trains a network.")
 
 
 def read_runs(folders: Sequence[Path]) -> tuple[list[Evaluation], list[dict[str, Any]]]:

@@ -191,7 +191,7 @@ def replayed_policy(options: Options) -> Path:
     if not path.exists():
         policy = Policy.load(source)
         loop = policy.closed_loop()
-        actions = loop(policy.params, *loop.standing(), round(seconds / CONTROL_TIMESTEP)).command[0]
+        actions = loop(policy.params, *loop.initial(), round(seconds / CONTROL_TIMESTEP)).command[0]
         job = dataset.Job(
             path.parent.name, "policy", np.round(actions, 3).astype(float), 300, "Actions of a vanilla policy."
         )

@@ -494,6 +494,7 @@ def main() -> None:
         return
     if not given.quick:
         check_code(drawn)
+    _setup.reserve(output, commit=drawn["commit"], seeds=drawn["seeds"], quick=given.quick)
     for unit in chosen:
         path = units / f"{unit.name}.json"
         if path.exists():

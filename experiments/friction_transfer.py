@@ -33,6 +33,8 @@ from ballu_mjx.common.results import Cell, Table
 from ballu_mjx.evaluation.transfer import Transfer
 from ballu_mjx.policies.locomotion_config import LocomotionConfig
 from ballu_mjx.policies.training import locomotion_ppo
+from ballu_mjx.residuals.trained_residual import TrainedResidual
+from ballu_mjx.robots.registry import load_robot
 
 WHOLE = pipeline.Options()
 """Number of control steps of each training, and of trials of each policy: those of `train all`."""
@@ -79,15 +81,16 @@ def main() -> None:
     rows = []
     for robot in chosen:
         _, residuals = foot_friction.fits(robot.hardware, options.fresh, robot.folder, options.quick)
+        place = robot.folder / "policies"
+        learned = {name: TrainedResidual.load(folders[0], load_robot()).sha256 for name, folders in residuals.items()}
+        _setup.reserve(place, robot=robot.hardware.name, residuals=learned)
         for method, folders in residuals.items():
-            made = [
-                trials_of(robot.hardware, method, folders[0], seed, robot.folder / "policies", options.quick)
-                for seed in seeds
-            ]
+            made = [trials_of(robot.hardware, method, folders[0], seed, place, options.quick) for seed in seeds]
             rows.append(row(robot.name, method, made))
     used = {"own robot": options.own, "PyBullet robot": options.bullet, "training": seeds}
     tables = {"walking": Table(("robot", "simulator", *(figure.title for figure in FIGURES)), tuple(rows))}
-    _setup.write_tables(tables, options.output, options.results, used)
+    # The folder itself has the table of `foot_friction.py`, which makes the same fits.
+    _setup.write_tables(tables, options.output / "transfer", options.results, used)
 
 
 if __name__ == "__main__":

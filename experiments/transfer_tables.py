@@ -31,6 +31,7 @@ import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import get_args
 
 sys.path.append("experiments")  # a notebook runs in the repository's root
 
@@ -44,6 +45,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from ballu_mjx.ballu.recordings import base_position
+from ballu_mjx.ballu.virtual.hardware import RobotFamily
 from ballu_mjx.cli import pipeline
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.common.results import write_results
@@ -195,7 +197,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2], help="training seeds (0 1 2)")
     parser.add_argument("--robot-seed", type=int, default=0, help="seed of the virtual robot (0)")
     parser.add_argument(
-        "--robot-family", choices=["default", "paper"], default="default", help="family of the virtual robot (default)"
+        "--robot-family", choices=get_args(RobotFamily), default="default", help="family of the virtual robot (default)"
     )
     parser.add_argument("--rounds", type=int, default=1, help="rounds of EnvMimic; see `train all --help` (1)")
     parser.add_argument(
@@ -209,6 +211,8 @@ def main() -> None:
     parser.add_argument("--figure-only", action="store_true", help="draw finished trials; run nothing")
     parser.add_argument("--results", type=Path, help="JSON file to write the table to")
     given = _setup.parse(parser, OUTPUT)
+    if given.figure_only and given.results is not None:
+        parser.error("--figure-only runs nothing, so that there are no results; leave out --results.")
     output = given.output
     written = []
     if not given.figure_only:

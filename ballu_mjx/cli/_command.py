@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
+import shlex
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -23,7 +24,8 @@ from ballu_mjx.rl.training_loop import TrainingInterrupted
 from ballu_mjx.robots.description import RobotDescription, check_simulates
 from ballu_mjx.robots.registry import DEFAULT_ROBOT, load_robot
 from ballu_mjx.runs.checkpoints import restore_checkpoint
-from ballu_mjx.runs.folder import Run, read_config, typed_config
+from ballu_mjx.runs.folder import Run, read_config, typed_config, typed_values
+from ballu_mjx.runs.layout import CONFIG_FILE
 from ballu_mjx.runs.record import MemoryRecord, TrainingRecord
 
 PROGRAM = "python -m ballu_mjx.train"
@@ -65,7 +67,8 @@ class TrainCommand:
         folder: Path | None = getattr(data, "resume", None)
         if folder is not None:
             config = read_config(folder, name)
-            kept = {option: config["data"][option] for option in _KEPT if option in config.get("data", {})}
+            given = {option: config["data"][option] for option in _KEPT if option in config.get("data", {})}
+            kept = typed_values(type(self.sections["data"]), given, "data", folder / CONFIG_FILE)
             stored = {
                 section: typed_config(type(default), config, section, folder)
                 for section, default in self.sections.items()
@@ -211,5 +214,5 @@ def open_run(
             yield run
         except TrainingInterrupted as stopped:
             print(f"Interrupted; saved at step {stopped.step:,}.", file=sys.stderr)
-            print(f"To resume: {PROGRAM} {content['task']} --resume {folder}", file=sys.stderr)
+            print(f"To resume: {PROGRAM} {content['task']} --resume {shlex.quote(str(folder))}", file=sys.stderr)
             raise

@@ -17,6 +17,8 @@ from typing import Annotated, Any, NamedTuple, TypeVar
 
 import tyro
 
+from ballu_mjx.common.errors import InputError
+
 _Options = TypeVar("_Options")
 _ASKS_FOR_HELP = ("-h", "--help")
 
@@ -155,3 +157,17 @@ def _field_docstrings(options: type) -> dict[str, str]:
             ):
                 found[field.target.id] = " ".join(text.value.value.split())
     return found
+
+
+def refuse_without(options: Any, names: Sequence[str], needed: str) -> None:
+    """Check that options which have no effect without another one, `needed`, have their defaults.
+
+    `options` is a dataclass, and `names` are names of its fields.
+
+    **Raises** `InputError` that names the first other option.
+    """
+    for name in names:
+        if getattr(options, name) != getattr(type(options), name):
+            raise InputError(
+                f"--{name.replace('_', '-')} has no effect without {needed}; leave it out, or add {needed}."
+            )

@@ -29,8 +29,8 @@ def cached_stage(
 ) -> Path:
     """Return the `folder` of a stage. Call `make` to fill it unless it is already there with the same key.
 
-    The key is a hash of `options` and of the keys of the stages `needs`. A folder with another key is renamed and kept.
-    A folder that was deleted is made again.
+    The key is a hash of `options` and of the keys of the stages `needs`. A folder with another key is renamed and kept,
+    and used again when its key returns. A folder that was deleted is made again.
     If a folder with the same key is unfinished, `make` continues in it if `goes_on` is true and it has checkpoints.
     Otherwise the folder is emptied first.
 
@@ -47,11 +47,14 @@ def cached_stage(
     if found is not None and found["key"] == key and found["done"]:
         return folder
     if found is not None and found["key"] != key:
-        aside = folder.with_name(f"{folder.name}.{found['key']}")
-        shutil.rmtree(aside, ignore_errors=True)
-        folder.rename(aside)
+        aside = _move(folder, folder.with_name(f"{folder.name}.{found['key']}"))
         print(f"{folder}: made with other options or inputs; renamed to {aside.name}.")
         found = None
+        earlier = folder.with_name(f"{folder.name}.{key}")
+        if earlier.is_dir() and stage_mark(earlier).exists() and read_mark(stage_mark(earlier))["done"]:
+            _move(earlier, folder)
+            print(f"{folder}: made with these options before; {earlier.name} renamed back.")
+            return folder
     print(f"\n== {folder.name}" + (" (resumed)" if goes_on and found is not None else ""), flush=True)
     if folder.exists() and not (goes_on and found is not None and list_checkpoints(folder)):
         shutil.rmtree(folder)  # unfinished (or empty), and `make` cannot continue in it
@@ -63,6 +66,14 @@ def cached_stage(
     jax.clear_caches()
     gc.collect()
     return folder
+
+
+def _move(folder: Path, place: Path) -> Path:
+    """Move a stage's folder and its key to another place, and return the place."""
+    shutil.rmtree(place, ignore_errors=True)  # left by versions that did not keep its key
+    folder.rename(place)
+    stage_mark(folder).rename(stage_mark(place))
+    return place
 
 
 def check_is_stage(folder: Path) -> None:

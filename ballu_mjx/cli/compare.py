@@ -27,6 +27,11 @@ _POINTS = 200
 _UNTOLD = ("seed", "num_timesteps")
 """Options that do not distinguish rows. A run counts with the steps that it has done, not with the number of steps that
 it was given."""
+_PLACES = (
+    *("recordings", "validation", "test", "robot", "actuators", "residual", "output", "resume", "wandb", "debug"),
+    *("coordinator", "num_processes", "process_id"),
+)
+"""Options of the data section that do not distinguish rows. The content of files does."""
 
 
 _MEAN_RATIO = "mean ratio"
@@ -56,6 +61,8 @@ class Row:
     label: str
     """Options and values in which the runs differ from other rows."""
     folders: tuple[Path, ...]
+    steps: str
+    """Unit of the steps in the runs' metrics (`registry.steps_of`)."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -76,7 +83,7 @@ def rows(folders: Sequence[Path]) -> list[Row]:
     **Raises** `InputError` if a folder is no run, is given twice, or has another task.
     """
     from ballu_mjx.policies.tasks import TASKS
-    from ballu_mjx.residuals.registry import RESIDUAL_TASKS
+    from ballu_mjx.residuals.registry import RESIDUAL_TASKS, steps_of
     from ballu_mjx.runs.folder import read_config
 
     if len({folder.resolve() for folder in folders}) < len(folders):
@@ -88,19 +95,38 @@ def rows(folders: Sequence[Path]) -> list[Row]:
                 f"{folder}: is a run of {config['task']!r}, {folders[0]} one of {configs[0]['task']!r}; compare runs "
                 "of one task."
             )
-    options = [_options(config) | _steps(folder) for folder, config in zip(folders, configs, strict=True)]
-    names = [name for name in options[0] if all(name in each for each in options)]
-    differing = [name for name in names if len({each.get(name) for each in options}) > 1]
+    options = [
+        _options(config) | _robot(config, configs) | _steps(folder)
+        for folder, config in zip(folders, configs, strict=True)
+    ]
+    differing = _differing(options)
     found: dict[str, list[Path]] = {}
     taken: set[tuple[str, Any]] = set()
     for folder, config, each in zip(folders, configs, options, strict=True):
-        label = ", ".join(f"{name} {each[name]}" for name in differing) or configs[0]["task"]
+        label = ", ".join(f"{name} {each[name]}" for name in differing if name in each) or config["task"]
         seed = next((config[section]["seed"] for section in ("ppo", "fit") if "seed" in config.get(section, {})), None)
         if (label, seed) in taken:
             label = f"{label} ({folder})"  # a repeated run is no other sample
         taken.add((label, seed))
         found.setdefault(label, []).append(folder)
-    return [Row(label, tuple(members)) for label, members in found.items()]
+    return [
+        Row(label, tuple(members), steps_of(configs[folders.index(members[0])]["task"]))
+        for label, members in found.items()
+    ]
+
+
+def _differing(options: Sequence[Mapping[str, str]]) -> list[str]:
+    """Return the properties that distinguish some of the runs.
+
+    A property distinguishes runs if all have it, or if it differs among those of one task, where it may be missing.
+    """
+    of_a_task = [[each for each in options if each["task"] == task] for task in {each["task"] for each in options}]
+    found = []
+    for name in dict.fromkeys(name for each in options for name in each):
+        among = [options] if all(name in each for each in options) else of_a_task
+        if any(len({each.get(name) for each in runs}) > 1 for runs in among):
+            found.append(name)
+    return found
 
 
 def figures(folder: Path) -> dict[str, float]:
@@ -174,7 +200,7 @@ def table(found: Mapping[str, Sequence[Mapping[str, float]]]) -> str:
 
 
 def curve(folders: Sequence[Path], name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-    """Return a learning curve of the metric `name`: control steps, mean over runs, and half-width of the interval.
+    """Return a learning curve of the metric `name`: steps, mean over runs, and half-width of the interval.
 
     It covers the steps that all runs have reached. None if a run has fewer than two values, or if the runs have no
     steps in common. The half-width is NaN for a single run.
@@ -209,33 +235,45 @@ def _compare(options: Options) -> None:
         return
     options.output.mkdir(parents=True, exist_ok=True)
     (options.output / "compare.md").write_text(text + "\n", encoding="utf-8")
-    curves = {
-        title: {row.label: line for row in found if (line := curve(row.folders, name)) is not None}
-        for name, title in CURVES.items()
-    }
-    panels = {title: lines for title, lines in curves.items() if lines}
+    panels: dict[tuple[str, str], dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]]] = {}
+    for name, title in CURVES.items():
+        for row in found:
+            line = curve(row.folders, name)
+            if line is not None:
+                panels.setdefault((title, row.steps), {})[row.label] = line
     if panels:
         plots.compared(options.output / "compare.png", panels)
     print(f"\nWritten to {options.output}." + ("" if panels else " These runs have no learning curves to draw."))
 
 
 def _options(config: Mapping[str, Any]) -> dict[str, str]:
-    """Return the properties that distinguish runs: task, options, robot, actuators, recordings and residual."""
+    """Return the properties that distinguish runs, without those of `_robot` and `_steps`."""
     found = {"task": config["task"]} | {
         name: json.dumps(value)
-        for section in ("env", "ppo", "fit")
+        for section, untold in (("env", _UNTOLD), ("ppo", _UNTOLD), ("fit", _UNTOLD), ("data", _PLACES))
         for name, value in config.get(section, {}).items()
-        if name not in _UNTOLD
+        if name not in untold
     }
-    from ballu_mjx.robots.registry import DEFAULT_ROBOT
-
-    robot = config.get("robot_description")
-    found["robot"] = DEFAULT_ROBOT if robot is None else Path(robot["path"]).name.removesuffix(".robot.json")
     found["actuators"] = "nominal" if config.get("actuators") is None else _digest(config["actuators"])
     for use, recordings in config.get("recordings", {}).items():
         found[f"{use} recordings"] = _digest([each["sha256"] for each in recordings])
     found["residual"] = config.get("residual") or "none"
     return found
+
+
+def _robot(config: Mapping[str, Any], configs: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    """Return the name of a run's robot. It has a digest of its files if those of this name differ among `configs`."""
+    from ballu_mjx.robots.registry import DEFAULT_ROBOT
+
+    def identity(config: Mapping[str, Any]) -> tuple[str, str]:
+        robot = config.get("robot_description")
+        if robot is None:
+            return DEFAULT_ROBOT, ""
+        return Path(robot["path"]).name.removesuffix(".robot.json"), robot["sha256"][:6]
+
+    name, version = identity(config)
+    versions = {other for called, other in map(identity, configs) if called == name}
+    return {"robot": name if len(versions) == 1 else f"{name} {version}".strip()}
 
 
 def _steps(folder: Path) -> dict[str, str]:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from ballu_mjx.cli._help import parse_options
+from ballu_mjx.cli._help import parse_options, refuse_without
 from ballu_mjx.common import files, runtime
 from ballu_mjx.common.errors import InputError
 
@@ -74,6 +74,8 @@ def _evaluate(options: Options) -> None:
     from ballu_mjx.sim.simulator import Simulator
     from ballu_mjx.viz.artifacts import write_evaluation
 
+    if not options.noise_floor:
+        refuse_without(options, ("capture_noise",), "--noise-floor")
     if not all(0 < noise < math.inf for noise in options.capture_noise):
         raise InputError(f"--capture-noise {options.capture_noise}: give two positive numbers (mm and deg).")
     config = read_config(options.run, *RESIDUAL_TASKS)

@@ -35,6 +35,7 @@ from ballu_mjx.ballu.virtual.robot import CaptureController, open_loop
 from ballu_mjx.ballu.virtual.trials import ExportedPolicy, run_trials
 from ballu_mjx.cli import train_aerodynamics, train_envmimic, train_forces, train_policy, train_sysid
 from ballu_mjx.cli._command import TrainCommand, written_to
+from ballu_mjx.cli._help import refuse_without
 from ballu_mjx.cli.cached_stages import SET_ASIDE, cached_stage, check_is_stage
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError
@@ -49,7 +50,6 @@ from ballu_mjx.policies.pipeline_layout import (
     NEAR,
     PAPER_PRESET,
     PAPER_SIMULATORS,
-    ROUNDS,
     SHARED,
     TABLES,
     WRENCH,
@@ -58,7 +58,7 @@ from ballu_mjx.policies.pipeline_layout import (
     table_file,
 )
 from ballu_mjx.policies.policy import Policy
-from ballu_mjx.policies.simulator_variants import SimulatorVariant
+from ballu_mjx.policies.simulator_variants import ROUNDS, SimulatorVariant
 from ballu_mjx.policies.tasks import TASKS
 from ballu_mjx.policies.training import locomotion_ppo
 from ballu_mjx.policies.transfer_prediction import predict_com_errors, read_prediction, replay_errors, write_prediction
@@ -417,7 +417,7 @@ class PipelineStages:
         """
         policies = [Policy.load(run, step) for step in _last_steps(run)]
         loop = policies[0].closed_loop()
-        start, count = loop.standing(), round(seconds / CONTROL_TIMESTEP)
+        start, count = loop.initial(), round(seconds / CONTROL_TIMESTEP)
         return [np.round(loop(p.params, *start, count).command[0], 3).astype(float) for p in policies]
 
 
@@ -467,6 +467,11 @@ def _draw(seed: int, task: str, use: str, number: int) -> int:
     return int.from_bytes(digest[:4], "big")
 
 
+def _repeated(given: Sequence[object]) -> object:
+    """Return the first entry that occurs more than once."""
+    return next(each for place, each in enumerate(given) if each in given[:place])
+
+
 def _check(options: Options) -> None:
     for name in ("trials", "takes", "policy_steps", "residual_steps", "rounds"):
         if getattr(options, name) < 1:
@@ -475,10 +480,16 @@ def _check(options: Options) -> None:
         raise InputError("--seeds and --robot-seed take numbers of 0 or more; give at least one seed.")
     if not options.tasks:
         raise InputError("--tasks is empty; name walk, turn, or both.")
+    for name in ("seeds", "tasks", "also"):
+        given = getattr(options, name)
+        if len(set(given)) < len(given):
+            raise InputError(f"--{name} names {_repeated(given)} twice; a repetition is no other sample.")
     config = LocomotionConfig(
         outside_cost=options.outside_cost, push_force=options.push_force, push_torque=options.push_torque
     )
     check_locomotion_config(config, CONTROL_TIMESTEP)
+    if NEAR not in options.also:
+        refuse_without(options, ("outside_cost",), f"--also {NEAR}")
     if options.output.exists() and not options.output.is_dir():
         raise InputError(f"{options.output}: is a file; give --output a folder.")
     files.check_folder(options.output)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import tyro
 
-from ballu_mjx.cli._help import parse_options
+from ballu_mjx.cli._help import parse_options, refuse_without
 from ballu_mjx.common import files, runtime
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.viz import video
@@ -41,6 +41,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         options = parse_options(Options, arguments, "python -m ballu_mjx report")
         if options.video:
             video.choose_renderer()
+        else:
+            refuse_without(options, ("show",), "--video")
         runtime.prepare()
         _report(options)
 

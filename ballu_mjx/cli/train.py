@@ -69,10 +69,13 @@ def _is_brief(arguments: Sequence[str]) -> bool:
     A resumed training then compiles as before, and gives the same numbers as an uninterrupted one. The options are read
     here because JAX has to be configured before they are parsed. Faults are reported by the parsing.
     """
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--resume", type=Path, nargs="?")
-    options, _ = parser.parse_known_args(arguments)
+    try:
+        options, _ = parser.parse_known_args(arguments)
+    except argparse.ArgumentError:  # for example --quick=yes
+        return False
     if options.quick or options.resume is None:
         return options.quick
     with contextlib.suppress(InputError, OSError, LookupError, TypeError):

@@ -13,10 +13,11 @@ import numpy as np
 from jaxtyping import Float
 
 from ballu_mjx.cli._command import TrainCommand, find_start, load_chosen_robot, open_run, written_to
+from ballu_mjx.cli._help import refuse_without
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.identification.actuators import AUTO, NOMINAL, read_actuators, read_validation
 from ballu_mjx.policies.closed_loop import Rollout
-from ballu_mjx.policies.locomotion_config import LocomotionConfig, check_task
+from ballu_mjx.policies.locomotion_config import DRAWN_OPTIONS, LocomotionConfig, check_task
 from ballu_mjx.policies.locomotion_env import variant_of
 from ballu_mjx.policies.policy import check_belongs
 from ballu_mjx.policies.tasks import Task
@@ -147,7 +148,9 @@ def summary(task: Task, rollout: Rollout, robot: RobotDescription, with_residual
         f"yaw {spread(yaw[:, -1] - yaw[:, 0], 0)} deg",
         *(f"{spread(np.array(values, float), 0)} {name}" for name, values in counts.items()),
     ]
-    runs = f"{len(way)} times {task.trial_seconds:g} s from its initial pose"
+    drawn = np.any(rollout.qpos[:, 0] != rollout.qpos[0, 0])
+    start = "drawn starting states" if drawn else "its initial pose"
+    runs = f"{len(way)} times {task.trial_seconds:g} s from {start}"
     text = f"In its own simulator, {runs}: {', '.join(figures)}."
     if rollout.divergence is not None:
         text += f" {rollout.divergence}"
@@ -182,11 +185,17 @@ def _parts(
     return actuators, residual, reference
 
 
+def _run(task: Task, data: Data, env: LocomotionConfig, ppo: PPOConfig) -> int:
+    if data.resume is None and not env.domain_randomization:
+        refuse_without(env, DRAWN_OPTIONS, "--domain-randomization")
+    return train(task, data, env, ppo)
+
+
 def command_for(task: Task) -> TrainCommand:
     """Return the command that trains a policy for a task."""
     return TrainCommand(
         f"{task.summary} In the nominal simulator, or one improved by --actuators and --residual.",
         {"data": Data(), "env": LocomotionConfig(), "ppo": locomotion_ppo()},
-        functools.partial(train, task),
+        functools.partial(_run, task),
         {"ppo": QUICK},
     )

@@ -56,6 +56,8 @@ _CHUNK = 100
 """Number of control steps in one call of the compiled program."""
 _BATCH = 8
 """Number of runs that it simulates in parallel. Fewer are filled up to this number; more are split into batches."""
+_NOISE_SEED = 1
+"""Seed of the noise of a residual that is sampled (`LocomotionConfig.sampled_residual`)."""
 
 
 class ClosedLoop:
@@ -102,12 +104,16 @@ class ClosedLoop:
         steps: int,
     ) -> Rollout:
         """Simulate `steps` control steps from each of the given states."""
-        parts = chunks(len(qpos), _BATCH)
-        rollouts = [self._batch(params, qpos[rows], qvel[rows], steps, kept) for rows, kept in parts]
+        parts = list(chunks(len(qpos), _BATCH))
+        # Not the keys of `standing`, so that the noise of a residual does not depend on the starting state.
+        keys = jax.random.split(jax.random.key(_NOISE_SEED), (len(parts), _BATCH))
+        rollouts = [
+            self._batch(params, qpos[rows], qvel[rows], own, steps, kept)
+            for (rows, kept), own in zip(parts, keys, strict=True)
+        ]
         return Rollout(*(np.concatenate(parts) for parts in zip(*rollouts, strict=True)))
 
-    def _batch(self, params: Params, qpos: np.ndarray, qvel: np.ndarray, steps: int, runs: int) -> Rollout:
-        keys = jax.random.split(jax.random.key(0), _BATCH)
+    def _batch(self, params: Params, qpos: np.ndarray, qvel: np.ndarray, keys: Array, steps: int, runs: int) -> Rollout:
         start = (jnp.asarray(x, jnp.float32) for x in (qpos, qvel))
         state = self._at(self._parameters, *start, keys)
         pieces = [tuple(np.asarray(x)[:, None] for x in self._look(state))]
@@ -120,6 +126,11 @@ class ClosedLoop:
         states = (np.concatenate(parts, axis=1)[:runs, : steps + 1] for parts in zip(*pieces, strict=True))
         per_step = (np.concatenate(parts, axis=1)[:runs, :steps] for parts in zip(*outcomes, strict=True))
         return Rollout(*states, *per_step)
+
+    def initial(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the initial pose at rest, as one starting state (qpos, qvel). Nothing is drawn."""
+        setting = self._parameters.setting
+        return np.asarray(setting.initial)[None], np.zeros((1, len(setting.spread.velocity)), np.float32)
 
     def standing(self, count: int = 1, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
         """Return `count` starting states (qpos, qvel), drawn as in training."""

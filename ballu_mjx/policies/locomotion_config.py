@@ -15,8 +15,8 @@ class LocomotionConfig:
     """Options of the simulator in which a policy is trained."""
 
     domain_randomization: bool = False
-    """Draw friction and the starting state anew for every episode, as in the paper. Without this option, --friction and
-    the options of start and pushes have no effect. Masses and buoyancy are not drawn, because they change gaits too
+    """Draw friction and the starting state anew for every episode, as in the paper. --friction and the
+    options of start and pushes need it. Masses and buoyancy are not drawn, because they change gaits too
     much."""
     friction: tuple[float, float] = (0.5, 1.1)
     """Range of the coefficient of sliding friction. One value is drawn for all geoms that collide. A residual that
@@ -52,7 +52,11 @@ class LocomotionConfig:
 
 
 _STARTS = ("start_yaw", "start_tilt", "start_angle", "start_offset", "start_velocity")
-_NOT_NEGATIVE = (*_STARTS, "push_force", "push_torque", "outside_cost")
+_LONGEST_EPISODE = 86_400.0
+"""Largest mean length of an episode (s): a day. Its number of control steps stays far below 2**31."""
+DRAWN_OPTIONS = ("friction", *_STARTS, "push_force", "push_torque")
+"""Options that have no effect without domain randomization."""
+_NOT_NEGATIVE = (*DRAWN_OPTIONS[1:], "outside_cost")
 
 
 def check_locomotion_config(config: LocomotionConfig, control_timestep: float) -> None:
@@ -64,9 +68,11 @@ def check_locomotion_config(config: LocomotionConfig, control_timestep: float) -
     if not 0 < low <= high < math.inf:
         raise InputError(f"--friction is {low:g} {high:g}: give two numbers above 0, the smaller first.")
     least = 2 * control_timestep
-    if not least <= config.episode_seconds < math.inf:
+    if not least <= config.episode_seconds <= _LONGEST_EPISODE:
+        nearest = _LONGEST_EPISODE if config.episode_seconds > _LONGEST_EPISODE else least
         raise InputError(
-            f"--episode-seconds is {config.episode_seconds:g}: it must be {least:g} or more; {least:g} is the nearest."
+            f"--episode-seconds is {config.episode_seconds:g}: it must be between {least:g} and {_LONGEST_EPISODE:g}; "
+            f"{nearest:g} is the nearest."
         )
     for name in _NOT_NEGATIVE:
         if not 0 <= getattr(config, name) < math.inf:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 from ballu_mjx.evaluation.transfer import Transfer, turning_table, walking_table
-from ballu_mjx.policies.simulator_variants import SimulatorVariant
+from ballu_mjx.policies.simulator_variants import ROUNDS, SimulatorVariant
 
 TABLES: Mapping[str, Callable[[Mapping[str, Sequence[Sequence[Transfer]]]], str]] = {
     "walk": walking_table,
@@ -31,8 +31,6 @@ PAPER_PRESET = "envmimic-paper"
 """Simulator with EnvMimic's forces, learned with the preset of the paper's options."""
 OPTIONAL_SIMULATORS = (NEAR, SHARED, WRENCH, PAPER_PRESET, "supervised", "analytic")
 """Optional simulators. The networks of the last two are learned by regression and by gradients."""
-ROUNDS = "envmimic"
-"""Residual that is learned again in each round. From the second round on, its name ends with the round's number."""
 
 
 def settings_beyond(folder: Path, task: str) -> tuple[str, ...]:
@@ -46,6 +44,11 @@ def settings_beyond(folder: Path, task: str) -> tuple[str, ...]:
 
     later = (SimulatorVariant(ROUNDS, round=number).name for number in itertools.count(2))
     return (*itertools.takewhile(there, later), *filter(there, OPTIONAL_SIMULATORS))
+
+
+def has_residual(setting: str) -> bool:
+    """Return whether a simulator has a residual."""
+    return SimulatorVariant.parse(setting).residual is not None
 
 
 def residual_folder(seed: Path, task: str, setting: str) -> Path:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 _VANILLA = "vanilla"
-_ROUNDS = "envmimic"
+ROUNDS = "envmimic"
 """Residual that is learned again in each round."""
 
 
@@ -36,6 +36,6 @@ class SimulatorVariant:
         if base == _VANILLA and set(improvements) <= {"sysid", "dr"}:
             return SimulatorVariant(identified="sysid" in improvements, randomized="dr" in improvements)
         method, _, number = name.rpartition("-")
-        if method == _ROUNDS and number.isdecimal() and int(number) > 1:
+        if method == ROUNDS and number.isdecimal() and int(number) > 1:
             return SimulatorVariant(method, round=int(number))
         return SimulatorVariant(name)

@@ -21,6 +21,10 @@ if TYPE_CHECKING:
     from ballu_mjx.sim.residual import Residual
 
 
+CONTROL_STEPS, GRADIENT_STEPS = "control steps", "gradient steps"
+"""Units of the steps in a run's metrics."""
+
+
 class StoredRun(NamedTuple):
     """A run of a residual, with its configuration."""
 
@@ -60,6 +64,8 @@ class ResidualKind:
     Other kinds are physical models, without either."""
     load: Callable[[StoredRun], LoadedResidual]
     """Function that loads a run. **Raises** `InputError` if files of the run are damaged."""
+    steps: str = CONTROL_STEPS
+    """Unit of the steps in a run's metrics."""
 
 
 def _load_network(run: StoredRun) -> LoadedResidual:
@@ -119,8 +125,8 @@ KINDS: Mapping[str, ResidualKind] = {
     kind.name: kind
     for kind in (
         ResidualKind("envmimic", "EnvMimic", True, _load_network),
-        ResidualKind("supervised", "supervised", True, _load_network),
-        ResidualKind("analytic", "analytic", True, _load_network),
+        ResidualKind("supervised", "supervised", True, _load_network, GRADIENT_STEPS),
+        ResidualKind("analytic", "analytic", True, _load_network, GRADIENT_STEPS),
         ResidualKind("aerodynamic", "aerodynamic", False, _load_aerodynamics),
         ResidualKind("fluid", "fluid forces", False, _load_fluid),
     )
@@ -130,3 +136,8 @@ RESIDUAL_TASKS = tuple(KINDS)
 """Tasks whose runs have a residual."""
 NETWORKS = tuple(name for name, kind in KINDS.items() if kind.network)
 """Tasks whose runs have a network that computes loads."""
+
+
+def steps_of(task: str) -> str:
+    """Return the unit of the steps in the metrics of a task's runs."""
+    return KINDS[task].steps if task in KINDS else CONTROL_STEPS

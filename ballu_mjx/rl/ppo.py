@@ -314,6 +314,8 @@ _MEAN, _STD = "Dense_0", "std_logparam"
 """Brax's names of the layer whose output is the mean of the action distribution, and of its standard deviations."""
 POLICY_OPTIONS = ("policy_layers", "activation", "normalize_observations", "observation_clip")
 """Options of `PPOConfig` on which the meaning of a policy's parameters depends."""
+START_OPTIONS = ("initial_std", "orthogonal_init")
+"""Options of `PPOConfig` that act on new networks alone."""
 
 
 def as_tree(params: Params) -> dict[str, Any]:

@@ -85,7 +85,8 @@ class ResumePoint:
         if stored is None:
             tell(f"{self.folder}: {anew}, because an older version saved only the parameters.")
         else:
-            if ppo_config.learning_rate != before["learning_rate"]:
+            # An adaptive rate continues where it was. A constant one is the option's.
+            if ppo_config.learning_rate != before["learning_rate"] or not ppo_config.desired_kl:
                 stored = training_state.with_learning_rate(stored, ppo_config.learning_rate)
             same = all(before[name] == made_with[name] for name in ("seed", "environments"))
             try:
@@ -114,7 +115,7 @@ def find_resume_point(
     before = read_config(folder, task)
     files.check_folder(folder)
     stored = typed_config(PPOConfig, before, "ppo", folder, ppo.check_values)
-    for name in (*ppo.POLICY_OPTIONS, "value_layers"):
+    for name in (*ppo.POLICY_OPTIONS, *ppo.START_OPTIONS, "value_layers"):
         if getattr(stored, name) != getattr(config, name):
             raise InputError(
                 f"--{name.replace('_', '-')} does not go with --resume: the stored parameters have "

@@ -62,6 +62,7 @@ from ballu_mjx.runs.layout import (
     shorten_value,
 )
 from ballu_mjx.runs.metrics import read_metrics
+from ballu_mjx.runs.rollout_file import ROLLOUT_FILE
 
 Config = TypeVar("Config")
 
@@ -152,9 +153,22 @@ def typed_config(
     type, or if `check` raises it.
     """
     path = folder / CONFIG_FILE
-    fields = {field.name: field for field in dataclasses.fields(cls)}  # pyright: ignore[reportArgumentType]
+    found = cls(**typed_values(cls, config_section(config, section, folder), section, path))
+    try:
+        check(found)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    return found
+
+
+def typed_values(cls: type, values: Mapping[str, Any], section: str, path: Path) -> dict[str, Any]:
+    """Return some values of a section of the `config.json` at `path`, in the types of the fields of dataclass `cls`.
+
+    **Raises** `InputError` that names the file and the field, if `cls` does not have a field, or if a value has another
+    type.
+    """
+    fields = {field.name for field in dataclasses.fields(cls)}
     hints = typing.get_type_hints(cls)
-    values = config_section(config, section, folder)
     for name, value in values.items():
         if name not in fields:
             raise InputError(
@@ -166,12 +180,7 @@ def typed_config(
                 f"{path}: {name} of {section} has an invalid value, {shorten_value(value)}; restore it or start a new "
                 "run."
             )
-    found = cls(**{name: _as_type(hints[name], value) for name, value in values.items()})
-    try:
-        check(found)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
-    return found
+    return {name: _as_type(hints[name], value) for name, value in values.items()}
 
 
 def config_section(config: Mapping[str, Any], key: str, folder: Path) -> Any:
@@ -182,6 +191,12 @@ def config_section(config: Mapping[str, Any], key: str, folder: Path) -> Any:
     if key not in config and config.get("format") == RUN_FORMAT:
         raise InputError(f'{folder / CONFIG_FILE}: "{key}" is missing; restore it or start a new run.')
     return config.get(key)
+
+
+_RESULTS = (ROLLOUT_FILE, "evaluation.json", "evaluation.txt")
+"""Files that are written after training. A resumed training writes them anew."""
+_MARKS = ("quick", "preset")
+"""Options of the data section that a run keeps when it is resumed."""
 
 
 class Run:
@@ -217,9 +232,15 @@ class Run:
         folder = self.folder
         if resumed_at is not None:
             kept = read_metrics(folder, resumed_at)
-            before = read_config(folder, config["task"]).get("starts", [])
+            earlier = read_config(folder, config["task"])
+            before = earlier.get("starts", [])
+            if "data" in earlier:
+                marks = {name: earlier["data"][name] for name in _MARKS if name in earlier["data"]}
+                config = {**config, "data": {**config.get("data", {}), **marks}}
             drop_checkpoints(folder, resumed_at)
             files.write(folder / METRICS_FILE, "".join(json.dumps(row) + "\n" for row in kept))
+            for name in _RESULTS:  # of the training so far
+                (folder / name).unlink(missing_ok=True)
             config = {**config, "starts": [*before, *config["starts"]]}
         files.write(folder / CONFIG_FILE, json.dumps(config, indent=2, default=str) + "\n")
         next_step = None if resumed_at is None else resumed_at + 1

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ballu_mjx.viz.style import colour_of, label_of, save_figure, unwrapped
+from ballu_mjx.viz.style import colour_of, label_of, save_figure, step_axis, unwrapped
 
 _QUANTITIES = ("x (m)", "y (m)", "yaw (deg)")
 
@@ -132,24 +132,25 @@ def _over_validation(
     return figure, upper, lower
 
 
-def compared(path: Path, panels: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray, np.ndarray]]]) -> None:
-    """Draw learning curves of several rows, with a panel for each metric.
+def compared(
+    path: Path, panels: Mapping[tuple[str, str], Mapping[str, tuple[np.ndarray, np.ndarray, np.ndarray]]]
+) -> None:
+    """Draw learning curves of several rows, with a panel for each metric and unit of its steps.
 
-    `panels[label][row]` holds control steps, mean, and half the width of the interval. An interval of NaN is not drawn.
+    `panels[metric, unit][row]` holds steps, mean, and half the width of the interval. An interval of NaN is not drawn.
     """
     figure = Figure(figsize=(8.0, 3.5 * len(panels)), layout="constrained")
     rows = list(dict.fromkeys(label for lines in panels.values() for label in lines))
-    for axis, (title, lines) in zip(
-        np.ravel(figure.subplots(len(panels), 1, sharex=True)), panels.items(), strict=True
-    ):
+    for axis, ((title, unit), lines) in zip(np.ravel(figure.subplots(len(panels), 1)), panels.items(), strict=True):
+        across, one = step_axis(unit)
         for label, (steps, mean, half) in lines.items():
             colour = f"C{rows.index(label)}"
-            axis.plot(steps / 1e6, mean, color=colour, label=label)
-            axis.fill_between(steps / 1e6, mean - half, mean + half, color=colour, alpha=0.2, linewidth=0)
+            axis.plot(steps / one, mean, color=colour, label=label)
+            axis.fill_between(steps / one, mean - half, mean + half, color=colour, alpha=0.2, linewidth=0)
         axis.set_ylabel(title)
         axis.grid(alpha=0.3)
         axis.legend(fontsize="small", title="mean, 95 % interval")
-        axis.set_xlabel("control steps (millions)")
+        axis.set_xlabel(across)
     save_figure(figure, path)
 
 

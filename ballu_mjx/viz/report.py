@@ -37,7 +37,7 @@ def render(content: Content) -> str:
         from plotly.offline import get_plotlyjs
 
         from ballu_mjx.viz import robot_meshes, viser_scene
-        from ballu_mjx.viz.style import label_of
+        from ballu_mjx.viz.style import label_of, step_axis
     except ImportError as error:
         raise InputError(
             f"The report needs {error.name}, which comes with the extra report: pip install -c constraints.txt -e "
@@ -53,7 +53,7 @@ def render(content: Content) -> str:
     pushed = {take.description.sha256: take.description for take in takes if robot_meshes.pushed_robot(take)}
     arrows = [robot_meshes.RobotShapes(robot).arrow_scale for robot in pushed.values()]
     shown = {
-        "curves": [_plot(_curve_rows([curve]), "control steps (millions)") for curve in content.curves],
+        "curves": [_plot(_curve_rows([curve]), step_axis(curve.steps)[0]) for curve in content.curves],
         "takes": [_plot(_take_rows(take), "time (s)") for take in takes],
         "stage": {"head": head, "own": own, "tail": tail},
     }
@@ -89,11 +89,14 @@ def _hex(name: str) -> str:
 
 
 def _curve_rows(curves: Sequence[Curve]) -> _Rows:
-    from ballu_mjx.viz.style import label_of
+    from ballu_mjx.viz.style import label_of, step_axis
 
-    return [
-        (c.title, [_Line(label_of(name), _hex(name), x / 1e6, y) for name, (x, y) in c.values.items()]) for c in curves
-    ]
+    rows = []
+    for each in curves:
+        _, one = step_axis(each.steps)
+        lines = [_Line(label_of(name), _hex(name), steps / one, y) for name, (steps, y) in each.values.items()]
+        rows.append((each.title, lines))
+    return rows
 
 
 def _take_rows(take: StoredRollout) -> _Rows:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shlex
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,6 +16,7 @@ import numpy as np
 
 from ballu_mjx.common import files
 from ballu_mjx.common.errors import InputError
+from ballu_mjx.residuals.registry import CONTROL_STEPS
 from ballu_mjx.runs.rollout_file import ROLLOUT_FILE, StoredRollout, read_rollouts
 
 if TYPE_CHECKING:
@@ -65,7 +67,9 @@ class Curve:
 
     title: str
     values: Mapping[str, tuple[np.ndarray, np.ndarray]]
-    """Control steps and values of the metric, by the name of a run."""
+    """Steps and values of the metric, by the name of a run."""
+    steps: str = CONTROL_STEPS
+    """Unit of the steps (`registry.steps_of`)."""
 
 
 @dataclasses.dataclass
@@ -104,21 +108,22 @@ def collect(folder: Path) -> Content:
 
 def _run(folder: Path) -> Content:
     from ballu_mjx.policies.tasks import TASKS
-    from ballu_mjx.residuals.registry import RESIDUAL_TASKS
+    from ballu_mjx.residuals.registry import RESIDUAL_TASKS, steps_of
     from ballu_mjx.runs.folder import read_config
 
     config = read_config(folder, *RESIDUAL_TASKS, "sysid", *TASKS)
     content = Content(f"{config['task']}: {folder.resolve().name}")
     start = (config.get("starts") or [{}])[-1]
     content.facts = [("folder", str(folder.resolve())), ("begun", str(start.get("time", "")))]
-    content.facts += [("command", " ".join(map(str, start.get("command", []))))]
+    content.facts += [("command", shlex.join(map(str, start.get("command", []))))]
     for use, used in config.get("recordings", {}).items():
         content.facts.append((f"{use} recordings", ", ".join(str(file["path"]) for file in used)))
     _add_evaluation(content, folder)
     _add_identification(content, folder)
     if (folder / "identification.txt").is_file():
         content.texts.append(("Identification", files.read_text(folder / "identification.txt")))
-    content.curves = _curves({config["task"]: folder})
+    unit = steps_of(config["task"])
+    content.curves = [dataclasses.replace(each, steps=unit) for each in _curves({config["task"]: folder})]
     figures = sorted(path for path in folder.glob("*.png") if path.name not in _INTERACTIVE)
     content.images = [(path.name, path.read_bytes()) for path in figures]
     if (folder / ROLLOUT_FILE).is_file():
@@ -152,7 +157,7 @@ def _story(folder: Path, tables: Mapping[str, str]) -> Content:
                 if image.is_file():
                     content.images.append((f"Trials on the robot: {where}, {setting}", image.read_bytes()))
             residuals: dict[Path, str] = {}  # two settings may share a residual
-            for setting in (pipeline_layout.ROUNDS, *pipeline_layout.settings_beyond(seed, task)):
+            for setting in filter(pipeline_layout.has_residual, settings[1:]):
                 residuals.setdefault(pipeline_layout.residual_folder(seed, task, setting), setting)
             for learned, setting in residuals.items():
                 name = f"{label_of(setting)}: {where}"

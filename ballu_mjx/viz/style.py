@@ -13,6 +13,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from ballu_mjx.policies.simulator_variants import SimulatorVariant
+from ballu_mjx.residuals.registry import GRADIENT_STEPS
 
 COLOURS: Mapping[str, str] = {
     "recording": "black",
@@ -112,3 +113,11 @@ def save_figure(figure: Figure, path: Path) -> None:
     """Write a figure as PNG, without a display."""
     FigureCanvasAgg(figure)
     figure.savefig(path, dpi=_DOTS_PER_INCH)
+
+
+def step_axis(steps: str) -> tuple[str, float]:
+    """Return the label of a learning curve's x axis, and the number of steps that is 1 on it.
+
+    `steps` is the unit of the run's metrics (`registry.steps_of`). Control steps are counted in millions.
+    """
+    return (steps, 1.0) if steps == GRADIENT_STEPS else (f"{steps} (millions)", 1e6)

@@ -62,9 +62,14 @@ def write(path: Path, take: StoredRollout) -> None:
     middle = ways.mean(axis=0)
     height = float(middle[:, 2].mean()) + shapes.above
     apart = np.linalg.norm(ways - middle, axis=-1).max(axis=0)
-    rate = round(1.0 / float(np.median(np.diff(take.time))))
+    rate = 1.0 / float(np.median(np.diff(take.time)))
     frames = imageio_ffmpeg.write_frames(
-        str(path), (WIDTH, HEIGHT), fps=rate, codec="libx264", quality=7, macro_block_size=16
+        str(path),
+        (WIDTH, HEIGHT),
+        fps=rate,  # pyright: ignore[reportArgumentType]  # it takes fractions, too
+        codec="libx264",
+        quality=7,
+        macro_block_size=16,
     )
     try:
         frames.send(None)

@@ -205,6 +205,7 @@ def test_quick_changes_defaults_but_not_given_options():
         (["walk", "--resume", "damaged"], False),
         (["walk", "--resume", "missing"], False),
         (["walk", "--resume"], False),
+        (["walk", "--quick=yes"], False),  # the command's own parser refuses it
         (["walk", "--output", "quick"], False),
     ],
 )
@@ -318,8 +319,26 @@ def test_resumed_run_keeps_its_options_except_given_ones(tmp_path: Path):
     data, ppo = given(f"learn --seed 6 --resume={tmp_path}")
     assert (data.validate_every, data.output, data.resume) == (7, None, tmp_path)
     assert (ppo.num_envs, ppo.seed) == (64, 6)
+    (tmp_path / "config.json").write_text(json.dumps(content | {"data": {"validate_every": "abc"}}))
+    with pytest.raises(InputError, match=r"config\.json: validate_every of data has an invalid value, 'abc'"):
+        given(f"learn --resume={tmp_path}")
     with pytest.raises(InputError, match="there is no run"):
         given(f"learn --resume {tmp_path / 'other'}")
+
+
+@pytest.mark.parametrize(
+    ("line", "sentence"),
+    [
+        ("train walk --push-force 0.1", "--push-force has no effect without --domain-randomization"),
+        ("train walk --friction 0.4 0.5", "--friction has no effect without --domain-randomization"),
+        ("train all --outside-cost 1", "--outside-cost has no effect without --also envmimic-near"),
+        ("evaluate run --capture-noise 1 1", "--capture-noise has no effect without --noise-floor"),
+        ("report run --show near-1", "--show has no effect without --video"),
+    ],
+)
+def test_options_without_effect_are_refused(line: str, sentence: str, capsys: pytest.CaptureFixture[str]):
+    assert main(line) == 2
+    assert sentence in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("line", ["train residual", "train envmimic --method envmimic", "train sysid --num-envs 3"])

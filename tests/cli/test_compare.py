@@ -103,6 +103,27 @@ def test_only_runs_of_equal_length_and_different_seeds_share_a_row(folders: list
     assert [row.label for row in compare.rows([*folders[:3], longer])] == ["steps 100", "steps 500"]
 
 
+def test_runs_that_differ_in_method_or_robot_have_rows_of_their_own(folders: list[Path], tmp_path: Path):
+    description = {"path": "/one/arm.robot.json", "sha256": "a" * 64}
+    sections = {"start_from": None, "quick": False, "output": "x"}
+    for folder in folders[:3]:
+        altered(folder, data=sections | {"output": str(folder)}, robot_description=description)
+    assert len(compare.rows(folders[:3])) == 1  # places of results do not distinguish runs
+    altered(folders[1], data=sections | {"start_from": "runs/supervised"})
+    altered(folders[2], data={"start_from": None, "quick": True})
+    assert [row.folders for row in compare.rows(folders[:3])] == [(folder,) for folder in folders[:3]]
+    altered(folders[1], data=sections, robot_description=description | {"path": "/two/arm.robot.json"})
+    assert [row.folders for row in compare.rows(folders[:2])] == [tuple(folders[:2])]
+    altered(folders[1], robot_description=description | {"sha256": "b" * 64})
+    assert len(compare.rows(folders[:2])) == 2
+
+
+def test_an_option_that_a_run_lacks_distinguishes_it(folders: list[Path], tmp_path: Path):
+    config = json.loads((folders[1] / "config.json").read_text())
+    altered(folders[1], env=config["env"] | {"force_cost": 0.1})
+    assert len(compare.rows(folders[:2])) == 2
+
+
 def test_a_single_run_has_no_interval(folders: list[Path], capsys: pytest.CaptureFixture[str]):
     assert compare.main([str(folders[0])]) == 0
     out = capsys.readouterr().out

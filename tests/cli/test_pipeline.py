@@ -63,6 +63,28 @@ def test_changed_option_remakes_dependent_stages_and_keeps_the_old_ones(tmp_path
     assert [(path / "result").read_text() for path in renamed] == ["2"]
 
 
+def test_a_stage_that_was_renamed_is_used_again_when_its_options_return(tmp_path):
+    first, second = {"a": 1, "b": 2, "c": 3}, {"a": 1, "b": 20, "c": 3}
+    run_stages(tmp_path, first)
+    assert run_stages(tmp_path, second) == ["b", "c"]
+    for options in (first, second, first):
+        assert run_stages(tmp_path, options) == []
+        assert (tmp_path / "b" / "result").read_text() == str(options["b"])
+    with pytest.raises(Interrupted):
+        run_stages(tmp_path, {"a": 1, "b": 30, "c": 3}, stop_at="b")
+    assert run_stages(tmp_path, first) == []
+    assert run_stages(tmp_path, {"a": 1, "b": 30, "c": 3}) == ["b", "c"]  # an unfinished one is made anew
+
+
+@pytest.mark.parametrize(
+    "options", [{"seeds": (0, 1, 0)}, {"tasks": ("walk", "walk")}, {"also": ("supervised", "supervised")}]
+)
+def test_repeated_entries_are_refused(tmp_path, options: dict):
+    """A copy is no other sample: intervals over seeds would be too narrow."""
+    with pytest.raises(InputError, match="twice; a repetition is no other sample"):
+        pipeline.run(Options(output=tmp_path / "out", **options))
+
+
 def test_folders_of_the_user_are_neither_used_nor_removed(tmp_path):
     own = tmp_path / "out" / "seed-0" / "walk-vanilla+dr" / "notes.txt"
     own.parent.mkdir(parents=True)

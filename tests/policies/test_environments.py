@@ -91,6 +91,13 @@ def test_a_batch_resets_each_robot_alone_and_repeats_with_the_same_seed(batch: L
 
 
 @pytest.mark.slow
+def test_batches_without_a_seed_differ(batch: LocomotionBatch):
+    """Environments of several processes would all learn from the same episodes otherwise."""
+    first, second = (LocomotionBatch(batch.env, 4).reset() for _ in range(2))
+    assert not np.array_equal(first, second)
+
+
+@pytest.mark.slow
 def test_the_residual_of_a_run_acts_in_its_environment(run: Path, rover: RobotDescription, batch: LocomotionBatch):
     simulator = load_simulator(run)
     assert simulator.residual is not None and simulator.robot.sha256 == rover.sha256

@@ -276,6 +276,15 @@ def test_residuals_of_one_kind_share_one_compiled_program():
     assert closed_loop[0] == closed_loop[1]
 
 
+def test_the_initial_pose_is_not_drawn():
+    """Exported open-loop commands begin there."""
+    env = LocomotionEnv(BALLU, TASKS["walk"], LocomotionConfig(domain_randomization=True))
+    loop = ClosedLoop(env, lambda params, seen: params.value * seen[:2])
+    qpos, qvel = loop.initial()
+    np.testing.assert_allclose(qpos[0], BALLU.adapter.initial_qpos(BALLU, MODEL), atol=1e-6)
+    assert qpos.shape == (1, MODEL.nq) and qvel.shape == (1, MODEL.nv) and not qvel.any()
+
+
 @pytest.mark.slow
 def test_closed_loop_agrees_with_steps_of_the_environment():
     infer = lambda params, seen: params.value * jnp.sin(10 * seen[:2])  # noqa: E731

@@ -31,7 +31,7 @@ from ballu_mjx.rl.training_loop import TrainingInterrupted, TrainingLoop, Valida
 from ballu_mjx.rl.training_state import TrainingState
 from ballu_mjx.rl.watchdog import Watchdog
 from ballu_mjx.runs.checkpoints import last_checkpoint, list_checkpoints, restore_checkpoint
-from ballu_mjx.runs.folder import Run, new_folder
+from ballu_mjx.runs.folder import Run, new_folder, read_config
 from ballu_mjx.runs.layout import RUN_FORMAT
 from ballu_mjx.runs.metrics import read_metrics
 from ballu_mjx.runs.progress import Progress
@@ -327,6 +327,47 @@ def test_a_trained_run_can_be_resumed_only_while_its_results_are_missing(tmp_pat
     (folder / "replay.npz").write_bytes(b"")
     with pytest.raises(InputError, match="already"):
         resumed(folder, CONFIG)
+
+
+def test_a_longer_training_does_not_keep_the_results_of_the_shorter_one(tmp_path, small):
+    """If it is stopped between its last checkpoint and its results, they could never be written otherwise."""
+    folder = saved(tmp_path / "run", small.init(5), content(), step=1120)
+    for name in ("replay.npz", "evaluation.json", "evaluation.txt"):
+        (folder / name).write_bytes(b"")
+    longer = dataclasses.replace(CONFIG, num_timesteps=2240)
+    state = small.init(5)
+    with Run(folder, content(longer), resumed_at=resumed(folder, longer).resumed_at) as run:
+        tree, training = ppo.as_tree(training_state.params(state)), training_state.stored(state)
+        run.save(2240, tree, -1.0, training=training, notes=training_facts(content(longer)))
+    assert not list(folder.glob("evaluation.*"))
+    assert resumed(folder, longer).step == 2240
+
+
+def test_a_resumed_run_keeps_its_mark_of_a_quick_run(tmp_path):
+    quick = content() | {"data": {"quick": True, "preset": "paper"}}
+    with Run(tmp_path / "run", quick):
+        pass
+    with Run(tmp_path / "run", content() | {"data": {"quick": False, "preset": None}}, resumed_at=-1):
+        pass
+    assert read_config(tmp_path / "run", "walk")["data"] == {"quick": True, "preset": "paper"}
+
+
+@pytest.mark.parametrize("change", [{"initial_std": 3.0}, {"orthogonal_init": True}])
+def test_options_of_new_networks_are_refused_with_resume(tmp_path, small, change):
+    folder = saved(tmp_path / "run", small.init(5), content())
+    with pytest.raises(InputError, match="does not go with --resume"):
+        resumed(folder, dataclasses.replace(CONFIG, **change))
+
+
+def test_a_constant_learning_rate_is_that_of_the_options_after_an_adaptive_one(tmp_path, small):
+    state = small.init(5)
+    stored = training_state.with_learning_rate(training_state.stored(state), 0.125)
+    adapted = small.resume(stored)[0]
+    start = resumed(saved(tmp_path / "run", adapted, content()), CONFIG)
+    for kl, rate in ((0.02, 0.125), (0.0, CONFIG.learning_rate)):
+        config = dataclasses.replace(CONFIG, desired_kl=kl)
+        again = training_state.stored(start.state(small, config, training_facts(content(config)), print))
+        assert again["optimizer.1.hyperparams.learning_rate"] == pytest.approx(rate)
 
 
 def test_watchdog_warns_once_per_standstill_and_differently_for_compilation(

@@ -255,7 +255,7 @@ def test_replay_is_stored_in_single_precision(tmp_path: Path):
     [
         (["{}/nowhere"], "there is no run"),
         (["{}", "--output", "{}"], "is a folder; give a file"),
-        (["{}", "--show", "far-9"], "there is no such replay; give one of near-1"),
+        (["{}", "--video", "--show", "far-9"], "there is no such replay; give one of near-1"),
     ],
 )
 def test_report_refuses_unsuitable_arguments(short: Path, capsys, arguments: list[str], message: str):
@@ -271,6 +271,17 @@ def test_damaged_evaluation_is_refused(short: Path, tmp_path: Path, capsys):
         assert main([str(folder)]) == 2
         error = capsys.readouterr().err
         assert "evaluation.json: " in error and "writes it again" in error and error.count("\n") == 1
+
+
+def test_learning_curves_have_the_steps_of_their_method(tmp_path: Path):
+    units = {"envmimic": "control steps (millions)", "analytic": "gradient steps"}
+    for task in units:
+        with Run(tmp_path / task, describe_run(task, {"env": EnvMimicConfig(), "ppo": PPOConfig()}, {}, [])) as run:
+            for step in (0, 300):
+                run.log(step, {"validation_error": 1.0})
+        text = report.render(report_content.collect(tmp_path / task))
+        shown = [unit for unit in units.values() if re.search(rf'"text":\s*"{re.escape(unit)}"', text)]
+        assert shown == [units[task]]
 
 
 def test_report_of_the_pipeline_shows_tables_and_overlaid_policies(tmp_path: Path):
@@ -291,11 +302,13 @@ def test_report_of_the_pipeline_shows_tables_and_overlaid_policies(tmp_path: Pat
         write_rollouts(folder / ROLLOUT_FILE, [episode])
     write_run(tmp_path / "seed-0" / "envmimic-walk", [take("actions-1", 21)])
     write_run(tmp_path / "seed-0" / "envmimic-walk-2", [take("actions-1", 22)])
+    write_run(tmp_path / "seed-0" / "aerodynamic-walk", [take("actions-1", 23)])
 
     content = report_content.collect(tmp_path)
     assert [(t.name, list(t.qpos), len(t.time)) for t in content.takes] == [
         ("policies: walk, seed-0", ["vanilla+dr", "envmimic", "envmimic-2"], 25),
         ("EnvMimic: walk, seed-0: actions-1", ["recording", "vanilla", "envmimic"], 21),
+        ("aerodynamic: walk, seed-0: actions-1", ["recording", "vanilla", "envmimic"], 23),
         ("EnvMimic, round 2: walk, seed-0: actions-1", ["recording", "vanilla", "envmimic"], 22),
     ]
     assert [list(curve.values) for curve in content.curves] == [["vanilla+dr", "envmimic", "envmimic-2"]]

@@ -182,7 +182,7 @@ def sources() -> dict[str, str]:
 def open_loop(policy: Policy, steps: int) -> Float[np.ndarray, "steps commands"]:
     """Return the policy's commands in its own simulator, from the initial pose."""
     loop = policy.closed_loop()
-    rollout = loop(policy.params, *loop.standing(), steps)
+    rollout = loop(policy.params, *loop.initial(), steps)
     if rollout.divergence is not None:
         _LOG.warning("%s", rollout.divergence)
     return np.asarray(rollout.command[0], float)
@@ -192,6 +192,8 @@ _FILES = ("controller.py", "estimator.py")
 
 
 def _check(options: ExportOptions) -> None:
+    if options.seconds is not None and not options.open_loop:
+        raise InputError("--seconds has no effect beside --no-open-loop; leave one of them out.")
     if options.seconds is not None and not 0 < options.seconds <= 3600:
         raise InputError(f"--seconds is {options.seconds:g}: it must be above 0, and 3600 or less.")
     for name in ("pulse_low", "pulse_high"):

@@ -60,11 +60,14 @@ class LocomotionBatch:
         self._reset, self._step = (
             compile_for_devices(function, shared=0, devices=devices) for function in (env.reset, self._advance)
         )
-        self._key = jax.random.key(0)
+        self._key = jax.random.key(np.random.SeedSequence().generate_state(1)[0])
         self._state: State | None = None
 
     def reset(self, seed: int | None = None) -> Float[np.ndarray, "envs observations"]:
-        """Start new episodes in all environments. `seed` determines all randomness from here on."""
+        """Start new episodes in all environments.
+
+        `seed` determines all randomness from here on. Without a seed so far, the system's entropy determines it.
+        """
         if seed is not None:
             self._key = jax.random.key(seed)
         self._key, own = jax.random.split(self._key)
