@@ -35,7 +35,7 @@ from ballu_mjx.evaluation.errors import (
     summarize_starts,
 )
 from ballu_mjx.identification.parameters import LEAST_FRICTION
-from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.recordings.motion import Motion, measured_hinges
 from ballu_mjx.recordings.recording_groups import group_of
 from ballu_mjx.recordings.reference import ReferenceMotions, pad_to_bucket, stack_motions
 from ballu_mjx.robots.description import RobotDescription
@@ -93,21 +93,17 @@ class Replay(NamedTuple):
         return self.euler_angles[..., 2]
 
 
-def measured_hinges(robot: RobotDescription, model: mujoco.MjModel, motion: Motion) -> dict[str, int]:
-    """Return the indices in `qpos` of the hinges whose angles are recorded, by name. Held joints are left out."""
-    found = {name: model.joint(name) for name in robot.joints if name in motion.joints and name not in robot.held}
-    return {
-        name: int(joint.qposadr[0]) for name, joint in found.items() if joint.type[0] == mujoco.mjtJoint.mjJNT_HINGE
-    }
-
-
 def evaluate(simulator: AugmentedSimulator, motions: Sequence[Motion]) -> Evaluation:
     """Return the open-loop errors of a simulator with and without its residual on recorded motions.
 
-    **Raises** `ValueError` if the simulator has no residual.
+    **Raises** `ValueError` if the simulator has no residual or a scaled one, and if there are no motions.
     """
     if simulator.residual is None:
         raise ValueError("The simulator has no residual; give one from `with_residual`.")
+    if simulator.scale is not None:
+        raise ValueError("The residual has a scale; errors are those of a whole residual.")
+    if not motions:
+        raise ValueError("There are no motions; give one or more.")
     evaluator = Evaluators(simulator.without_residual()).of(simulator.residual.model, motions)
     return evaluator(simulator.residual.params)
 

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.recordings.motion import Motion
+from ballu_mjx.recordings.motion import Motion, measured_hinges
 from ballu_mjx.recordings.recording_groups import group_of
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters, bare_parameters
@@ -106,7 +106,7 @@ class Choice:
             f"{words} of {row.group} recordings over {row.horizon:g} s ({row.ratio(quantity):.2f} times the error)"
             for row in self.rows
             for quantity, words in _WORDS.items()
-            if row.ratio(quantity) > 1
+            if not np.isnan(getattr(row.nominal, quantity)) and row.ratio(quantity) > 1
         )
 
     def table(self) -> str:
@@ -162,7 +162,8 @@ def choose_actuators(
             pair = [found.get((group, horizon)) for found in both]
             if pair[0] is not None and pair[1] is not None:
                 rows.append(ReplayRow(group, horizon, len(pair[0]), *_summaries(pair[0], pair[1])))
-    by_joints = robot.anchored and not np.isnan(rows[0].nominal.joints)
+    model = robot.load_model()
+    by_joints = robot.anchored and all(measured_hinges(robot, model, motion) for motion in motions)
     return Choice(identified, tuple(rows), "joints" if by_joints else "position")
 
 
@@ -173,10 +174,15 @@ def _starts(motion: Motion, horizon: float, robot: RobotDescription) -> Int[np.n
 
 
 def _summaries(*sides: Float[np.ndarray, "starts 2"]) -> list[ReplayErrors]:
-    """Return each side's mean errors over the starts that diverged on no side. Infinite if there is none."""
+    """Return each side's mean errors over the starts that diverged on no side. Infinite if there is none.
+
+    Joint errors are NaN for recordings without hinges.
+    """
     finite = [np.isfinite(errors[:, 0]) for errors in sides]
     common = np.logical_and.reduce(finite)
-    means = [errors[common].mean(axis=0) if common.any() else (np.inf, np.inf) for errors in sides]
+    without = np.isnan(np.concatenate(sides)[:, 1]).any()
+    none = (np.inf, np.nan if without else np.inf)
+    means = [errors[common].mean(axis=0) if common.any() else none for errors in sides]
     return [
         ReplayErrors(float(position), float(joints), int(np.sum(~own)))
         for (position, joints), own in zip(means, finite, strict=True)
@@ -187,7 +193,7 @@ def _replay(
     robot: RobotDescription, parameters: ModelParameters | None, motions: Sequence[Motion], horizons: Sequence[float]
 ) -> dict[tuple[str, float], Float[np.ndarray, "starts 2"]]:
     """Return the position and joint errors of every start, by group and horizon. inf if the start diverged."""
-    model = robot.load_model(parameters)
+    model, nominal = robot.load_model(parameters), robot.load_model()
     substeps = count_substeps(model, robot.control_timestep)
     found: dict[tuple[str, float], list[np.ndarray]] = {}
     for motion in motions:
@@ -197,9 +203,10 @@ def _replay(
         steps = min(round(max(horizons) / robot.control_timestep), len(motion.command))
         ctrl = physics_commands(parameters, motion.command, substeps, float(model.opt.timestep))
         qpos, intact = simulate_motion(model, motion, starts, ctrl, steps, substeps)
-        ways = [_look(model, robot, each) for each in (motion.qpos, qpos.reshape(-1, model.nq))]
-        (recorded, angles), (position, joints) = ways
-        position, joints = position.reshape(len(starts), steps, 3), joints.reshape(len(starts), steps, -1)
+        hinges = list(measured_hinges(robot, nominal, motion).values())
+        recorded, position = _look(nominal, robot, motion.qpos), _look(model, robot, qpos.reshape(-1, model.nq))
+        angles, joints = motion.qpos[:, hinges], qpos[..., hinges]
+        position, joints = position.reshape(len(starts), steps, 3), joints.reshape(len(starts), steps, len(hinges))
         for horizon in horizons:
             count = round(horizon / robot.control_timestep)
             errors = []
@@ -210,7 +217,8 @@ def _replay(
                 far = np.sqrt(np.mean(np.sum((position[run, :count] - recorded[later]) ** 2, axis=1)))
                 turned = joints[run, :count] - angles[later]
                 turn = np.sqrt(np.mean(turned**2)) if turned.size else np.nan
-                errors.append([far, turn] if intact[run, :count].all() else [np.inf, np.inf])
+                diverged = [np.inf, np.inf if turned.size else np.nan]
+                errors.append([far, turn] if intact[run, :count].all() else diverged)
             if errors:
                 found.setdefault((group_of(motion.name), horizon), []).extend(map(np.array, errors))
     return {key: np.array(errors) for key, errors in found.items()}
@@ -245,7 +253,7 @@ def simulate_motion(
         data.qpos[:], data.qvel[:] = motion.qpos[start], motion.qvel[start]
         mujoco.mj_getState(model, data, row, kind)
     place = np.minimum(starts[:, None] * substeps + np.arange(steps * substeps), len(ctrl) - 1)
-    with _quiet():
+    with without_warnings():
         state, _ = mujoco.rollout.rollout(model, data, initial, ctrl[place])
     after = np.asarray(state, float)[:, substeps - 1 :: substeps]
     # MuJoCo resets a simulation that diverges. Its time then differs from the expected one.
@@ -255,7 +263,7 @@ def simulate_motion(
 
 
 @contextlib.contextmanager
-def _quiet() -> Iterator[None]:
+def without_warnings() -> Iterator[None]:
     """Suppress MuJoCo's warnings of divergence, on the screen and in its log file in the current folder."""
     before = mujoco.get_mju_user_warning()
     mujoco.set_mju_user_warning(lambda _: None)
@@ -267,14 +275,12 @@ def _quiet() -> Iterator[None]:
 
 def _look(
     model: mujoco.MjModel, robot: RobotDescription, qpos: Float[np.ndarray, "states nq"]
-) -> tuple[Float[np.ndarray, "states 3"], Float[np.ndarray, "states hinges"]]:
-    """Return the position of the tracked site (m) and the angles of the recorded hinges (rad)."""
+) -> Float[np.ndarray, "states 3"]:
+    """Return the position of the tracked site (m)."""
     data, site = mujoco.MjData(model), model.site(robot.tracked).id
     position = np.zeros((len(qpos), 3))
     for number, row in enumerate(qpos):
         data.qpos[:] = row
         mujoco.mj_kinematics(model, data)
         position[number] = data.site_xpos[site]
-    joints = [model.joint(name) for name in robot.joints]
-    hinges = [int(j.qposadr[0]) for j in joints if j.type[0] == mujoco.mjtJoint.mjJNT_HINGE]
-    return position, qpos[:, hinges]
+    return position

@@ -48,9 +48,9 @@ def identify_actuators(
 
     **Raises** `InputError` if the recordings cannot be used, or if this robot's actuators cannot be identified.
     """
-    by_file = recordings if isinstance(recordings, Mapping) else {Path(each.name): each for each in recordings}
+    by_file = recordings if isinstance(recordings, Mapping) else _by_name(recordings)
     if not by_file:
-        raise InputError("There are no suspended recordings to identify actuators from; give some.")
+        raise InputError("There are no recordings to identify actuators from; give some.")
     if declares_parameters(robot):
         from ballu_mjx.identification.declared import identify_declared  # slow to import
 
@@ -134,3 +134,15 @@ def actuators_from_json(robot: RobotDescription, values: Mapping[str, Any], path
     if values.get("format") == IDENTIFIED_FORMAT:
         return identified_from_json(values, path, robot)
     return robot.adapter.actuators_from_json(robot, values, path)
+
+
+def _by_name(recordings: Sequence[Recording]) -> dict[Path, Recording]:
+    """Return recordings by name.
+
+    **Raises** `InputError` if two have the same name.
+    """
+    found: dict[Path, Recording] = {}
+    for each in recordings:
+        if found.setdefault(Path(each.name), each) is not each:
+            raise InputError(f"Two recordings have the name {each.name}; give a mapping from their files instead.")
+    return found

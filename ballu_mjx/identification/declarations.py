@@ -28,17 +28,22 @@ that a rigid body can have.
 from __future__ import annotations
 
 import math
+import re
+import typing
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
+import jax
 import mujoco
 import numpy as np
+from mujoco import mjx
 
 from ballu_mjx.common.errors import InputError, is_number
 from ballu_mjx.identification.body_deformation import BODY_QUANTITIES, UNDEFORMED
 from ballu_mjx.identification.parameters import BodyTarget, CommandTarget, FieldTarget, Parameter, ParameterSet, Target
 from ballu_mjx.robots.description import RobotDescription
+from ballu_mjx.sim.c_model import DERIVED_FIELDS
 from ballu_mjx.sim.drivetrain import QUANTITIES
 
 _BODY_GROUPS = {
@@ -149,6 +154,8 @@ _UNITS_OF_LENGTHS = {
 }
 """Units of slides and tendons."""
 _SCALAR_JOINTS = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+_DERIVED = (*DERIVED_FIELDS, "dof_M0", "tendon_length0", "actuator_acc0")
+"""Fields that MuJoCo computes from others."""
 _SIGNED = ("springref", "bias", "offset")
 """Fields whose values may be below 0."""
 _FACTOR = 4.0
@@ -195,6 +202,8 @@ class _Declaration:
                 f"ties elements whose nominal values differ ({shown})", 'write "targets", each with its "factor"'
             )
         name = "_and_".join(dict.fromkeys(str(part[1]) for part in parts)) + f"_{parts[0][2]}"
+        name = re.sub(r"\W+", "_", name).strip("_")
+        name = name if name.isidentifier() else f"_{name}"
         return [self._parameter(name, parts[0], nominal, tuple(targets))]
 
     def _parts(self) -> list[tuple[str, str, str, float]]:
@@ -230,6 +239,9 @@ class _Declaration:
             self.refuse('has no "field"', f"write one of {', '.join(self._known(kinds[0]))}")
         if not is_number(factor) or factor == 0:
             self.refuse(f'has the "factor" {factor!r}', "write a number other than 0")
+        signed = field in _SIGNED or (kinds[0] == "body" and field != "mass")
+        if factor < 0 and not signed and field in self._known(kinds[0]):
+            self.refuse(f'has the "factor" {factor!r}', f"{field} must be 0 or more; write a factor above 0")
         if "index" in entry:
             field = f"{field}[{entry['index']}]"
         return [(kinds[0], each, field, float(factor)) for each in elements]
@@ -292,6 +304,10 @@ class _Declaration:
         known = name.startswith(_PREFIXES[kind]) and isinstance(getattr(self.model, name, None), np.ndarray)
         if not known or name in ("body_mass", "body_ipos", "body_iquat", "body_inertia"):
             self.refuse(f'has the field "{field}"', f"there are {', '.join(self._known(kind))}, and MuJoCo's own names")
+        if name in _DERIVED:
+            self.refuse(f'has the field "{field}", which MuJoCo derives', "name a field that it follows from")
+        if typing.get_type_hints(mjx.Model).get(name) is not jax.Array:
+            self.refuse(f'has the field "{field}", which MJX does not simulate', "name another field")
         shape = getattr(self.model, name).shape[1:]
         number = rest.removesuffix("]")
         if not rest:

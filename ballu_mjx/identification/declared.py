@@ -28,6 +28,7 @@ from ballu_mjx.identification.undeclared import Suggestion, suggest_parameters, 
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.recordings.recording import Recording
+from ballu_mjx.recordings.validation import TIME_TOLERANCE
 from ballu_mjx.robots.adapter import IdentificationProgress, IdentifiedActuators
 from ballu_mjx.robots.description import RobotDescription
 
@@ -77,7 +78,8 @@ def check_recordings(
                 "or a model without the free joint."
             )
     for option, group in (("--recordings", recordings), ("--validation", validation)):
-        if group and all(recording.time[-1] - recording.time[0] < window_seconds for recording in group.values()):
+        shortest = window_seconds * (1 - TIME_TOLERANCE)
+        if group and all(recording.time[-1] - recording.time[0] < shortest for recording in group.values()):
             raise InputError(
                 f"{next(iter(group))}: none of {option} lasts {window_seconds:g} s; give longer recordings, or a "
                 "shorter --window-seconds."

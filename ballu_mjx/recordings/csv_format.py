@@ -25,6 +25,7 @@ from ballu_mjx.recordings.validation import (
     blank_held,
     check_cells,
     check_gaps,
+    check_lengths,
     check_time,
     has_sample,
     present_groups,
@@ -56,6 +57,7 @@ def read_recording(path: Path | str, robot: RobotDescription) -> Recording:
     kind, made_by, notes = _read_description(description)
     groups = present_groups(path, columns, known, kind)
     check_time(path, columns["time"], robot)
+    check_lengths(path, columns, groups)
     held = blank_held(path, columns, groups)
     check_cells(path, columns, groups, robot, kind)
     first, last = check_gaps(path, columns, groups, kind)

@@ -28,6 +28,8 @@ def load_recordings(source: str | Path | Iterable[str | Path], robot: RobotDescr
         paths = bundled_recordings(typing.cast(Split, source), robot)
     else:
         paths = list_recordings([source] if isinstance(source, str | Path) else source)
+    if not paths:
+        raise InputError("No recording is given; name files or folders.")
     return [read_recording(path, robot) for path in paths]
 
 

@@ -5,8 +5,11 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 
+import mujoco
 import numpy as np
 from jaxtyping import Float
+
+from ballu_mjx.robots.description import RobotDescription
 
 
 @dataclasses.dataclass(frozen=True)
@@ -81,3 +84,11 @@ class Motion:
     """Joints whose positions were recorded. Others are inferred."""
     uncertainty: Mapping[str, float] = dataclasses.field(default_factory=dict)
     """Uncertainties that the robot's adapter reports for its part of the reconstruction, by name."""
+
+
+def measured_hinges(robot: RobotDescription, model: mujoco.MjModel, motion: Motion) -> dict[str, int]:
+    """Return the indices in `qpos` of the hinges whose angles are recorded, by name. Held joints are left out."""
+    found = {name: model.joint(name) for name in robot.joints if name in motion.joints and name not in robot.held}
+    return {
+        name: int(joint.qposadr[0]) for name, joint in found.items() if joint.type[0] == mujoco.mjtJoint.mjJNT_HINGE
+    }

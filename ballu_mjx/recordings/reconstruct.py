@@ -36,6 +36,7 @@ from ballu_mjx.recordings.kinematic_tree import KinematicTree
 from ballu_mjx.recordings.motion import MeasurementGrid, Motion, ReconstructionParameters
 from ballu_mjx.recordings.recording import Recording
 from ballu_mjx.recordings.recording_hooks import hooks_of
+from ballu_mjx.recordings.validation import check_complete
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.sim.drivetrain import DrivetrainParameters, count_slots, filter_commands
 from ballu_mjx.sim.simulator import Simulator
@@ -116,11 +117,13 @@ def resample(recording: Recording, model: mujoco.MjModel, robot: RobotDescriptio
 
     A spline would overshoot where jitter brings noisy samples close together.
 
-    **Raises** `ValueError` for a suspended recording, and for one shorter than two control steps.
+    **Raises** `ValueError` for a suspended recording, and for one shorter than two control steps. **Raises**
+    `InputError` from `check_complete`.
     """
     position, quaternion = recording.tracked_position, recording.tracked_quaternion
     if recording.kind != "free" or position is None or quaternion is None:
         raise ValueError(f"{recording.name}: a suspended recording has no motion to reconstruct; give a free one.")
+    check_complete(recording, robot)
     per_step, grid = control_grid(recording, robot.control_timestep)
     linear = functools.partial(interpolate, grid, recording.time - recording.time[0])
 

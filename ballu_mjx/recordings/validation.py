@@ -11,11 +11,13 @@ from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.recordings.recording import Column, ColumnGroup, Kind, Quantity
+from ballu_mjx.recordings.recording import Column, ColumnGroup, Kind, Quantity, Recording
 from ballu_mjx.robots.description import RobotDescription
 
 LONGEST_GAP = 0.5
 """Longest time (s) without a sample that is interpolated."""
+TIME_TOLERANCE = 1e-6
+"""Relative tolerance of durations. Differences of written times are rounded."""
 SHORTEST = 1.0
 """Minimum duration of a recording (s)."""
 _LARGEST_STEP = 0.02
@@ -106,7 +108,7 @@ def check_time(path: Path, time: Column, robot: RobotDescription) -> None:
         fix = "record the times of capture, not the times of arrival"
         row = first_true(steps > _BURST * np.median(steps))
         refuse_recording(path, problem, fix, column="time", row=None if row is None else row + 1)
-    if time[-1] - time[0] < SHORTEST * (1 - 1e-6):
+    if time[-1] - time[0] < SHORTEST * (1 - TIME_TOLERANCE):
         problem = f"{time[-1] - time[0]:.3g} s are shorter than {SHORTEST:g} s"
         refuse_recording(path, problem, "record longer or leave it out", column="time", row=len(time) - 1)
 
@@ -165,8 +167,6 @@ def check_cells(
         if limits.speed is not None:
             _check_jumps(path, name, columns, limits.speed)
     for group in groups:
-        if group.quantity == "quaternion":
-            _check_lengths(path, group.names, columns)
         if group.quantity in _LARGEST_BEND:
             _check_bends(path, group, columns)
 
@@ -216,14 +216,21 @@ def _movements(values: Float[np.ndarray, "T columns"], quantity: Quantity) -> Fl
     return (turned[:-1].inv() * turned[1:]).as_rotvec() if len(values) > 1 else np.zeros((0, 3))
 
 
-def _check_lengths(path: Path, names: Sequence[str], columns: dict[str, Column]) -> None:
-    """Refuse quaternions that do not have unit length."""
-    with np.errstate(over="ignore"):
-        length = np.linalg.norm(np.stack([columns[name] for name in names], 1), axis=1)
-    row = first_true(np.abs(length - 1) > _QUATERNION_TOLERANCE)
-    if row is not None:
-        problem = f"the quaternion {names[0]} ... {names[-1]} has length {length[row]:.3g} instead of 1"
-        refuse_recording(path, problem, "export unit quaternions in w, x, y, z order", column=names[0], row=row)
+def check_lengths(path: Path, columns: dict[str, Column], groups: Sequence[ColumnGroup]) -> None:
+    """Check that quaternions have unit length.
+
+    **Raises** `InputError` that names the column and the row otherwise.
+    """
+    for group in groups:
+        if group.quantity != "quaternion":
+            continue
+        names = group.names
+        with np.errstate(over="ignore"):
+            length = np.linalg.norm(np.stack([columns[name] for name in names], 1), axis=1)
+        row = first_true(np.abs(length - 1) > _QUATERNION_TOLERANCE)
+        if row is not None:
+            problem = f"the quaternion {names[0]} ... {names[-1]} has length {length[row]:.3g} instead of 1"
+            refuse_recording(path, problem, "export unit quaternions in w, x, y, z order", column=names[0], row=row)
 
 
 def _angle_bounds(robot: RobotDescription) -> dict[str, tuple[float, float]]:
@@ -367,7 +374,7 @@ def check_gaps(path: Path, columns: dict[str, Column], groups: Sequence[ColumnGr
                 problem = f"{lacking[gap]:.3g} s are missing in a row, more than {LONGEST_GAP:g} s"
                 refuse_recording(path, problem, fix, column=name, row=row)
             first, last = max(first, int(seen[0])), min(last, int(seen[-1]))
-    if time[last] - time[first] < SHORTEST * (1 - 1e-6):
+    if time[last] - time[first] < SHORTEST * (1 - TIME_TOLERANCE):
         problem = f"all columns have samples for {max(0.0, time[last] - time[first]):.3g} s only"
         refuse_recording(path, problem, f"record {SHORTEST:g} s or longer", column="time", row=first)
     return first, last
@@ -381,3 +388,34 @@ def has_sample(columns: dict[str, Column], names: Iterable[str]) -> Bool[np.ndar
 def first_true(bad: np.ndarray) -> int | None:
     """Return the index of the first true entry, or None."""
     return int(bad.argmax()) if bad.any() else None
+
+
+def check_complete(recording: Recording, robot: RobotDescription) -> None:
+    """Check a recording that was made in memory: increasing times, all commands, and no missing values.
+
+    **Raises** `InputError` that names the recording, the column and the row.
+    """
+    rows = len(recording.time)
+    columns = {"time": recording.time[:, None], "command": recording.command}
+    for name, value in (("position", recording.tracked_position), ("quaternion", recording.tracked_quaternion)):
+        if value is not None:
+            columns[f"{name} of {robot.tracked}"] = value
+    columns |= {f"position of {site}": value for site, value in recording.points.items()}
+    columns |= {f"quaternion of {site}": value for site, value in recording.orientations.items()}
+    columns |= {joint: value[:, None] for joint, value in recording.joint_angles.items()}
+    if recording.command.shape[-1] != len(robot.commands):
+        raise InputError(
+            f"{recording.name}: has {recording.command.shape[-1]} commands; {robot.name} has {len(robot.commands)}."
+        )
+    for name, values in columns.items():
+        if len(values) != rows:
+            raise InputError(f"{recording.name}: {name} has {len(values)} samples, and time has {rows}.")
+        row = first_true(np.asarray(~np.isfinite(values).all(axis=1)))
+        if row is not None:
+            raise InputError(
+                f"{recording.name}: {name} is not finite in row {row}; fill gaps, or write the recording to a file and "
+                "read it."
+            )
+    row = first_true(np.diff(recording.time) <= 0)
+    if row is not None:
+        raise InputError(f"{recording.name}: time does not increase after row {row}; sort the samples.")

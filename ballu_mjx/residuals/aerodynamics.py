@@ -111,7 +111,7 @@ class Aerodynamics(Residual):
         self._centre = jnp.asarray(model.body_ipos)
         self._timestep, self._substeps = float(model.opt.timestep), count_substeps(model, robot.control_timestep)
         self._gravity = float(np.linalg.norm(model.opt.gravity))
-        self._friction = jnp.asarray(model.geom_friction)
+        self._friction, self._pair_friction = jnp.asarray(model.geom_friction), jnp.asarray(model.pair_friction)
 
     @property
     def name(self) -> str:
@@ -129,10 +129,14 @@ class Aerodynamics(Residual):
         """
         centre = self._centre.at[self._body.id].add(params.centre)
         friction = self._friction.at[:, 0].multiply(1 + params.friction)
+        # Both tangential directions of contacts between explicit pairs of geoms.
+        pairs = {"pair_friction": self._pair_friction.at[:, :2].multiply(1 + params.friction)}
+        pairs = pairs if len(self._pair_friction) else {}
         lifted = params.lift / self._gravity
         return {
             "body_ipos": centre,
             "geom_friction": friction,
+            **pairs,
             **self._body.fields(params.added_mass, params.added_inertia, lifted),
         }
 

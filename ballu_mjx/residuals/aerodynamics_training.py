@@ -59,7 +59,7 @@ def fit_aerodynamics(
     config = config or AirConfig()
     check_air_config(config, simulator.control_timestep)
     known = {"delay"} if has_delay(simulator) else set()
-    if not len(colliding_geoms(simulator.mj_model)):
+    if not len(colliding_geoms(simulator.mj_model)) and not simulator.mj_model.npair:
         known.add("friction")
     free = [name for name in free if name not in known]
     if not free:

@@ -16,6 +16,7 @@ from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reconstruct import reconstruct_for_simulator
 from ballu_mjx.recordings.recording import Recording, Split
 from ballu_mjx.recordings.recording_groups import group_of
+from ballu_mjx.recordings.validation import TIME_TOLERANCE
 from ballu_mjx.residuals.run_config import find_recordings, run_actuators
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.model import ModelParameters, same_parameters
@@ -257,7 +258,7 @@ def check_recording(path: Path, recording: Recording, robot: RobotDescription, *
         )
     shortest = shortest_recording(robot)
     duration = recording.time[-1] - recording.time[0]
-    if long_enough and duration < shortest:
+    if long_enough and duration < shortest * (1 - TIME_TOLERANCE):
         raise InputError(
             f"{path}: lasts {duration:.1f} s; validation and test need {shortest:g} s or more, use it for training."
         )

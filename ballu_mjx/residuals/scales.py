@@ -29,7 +29,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from scipy.spatial.transform import Rotation
 
-from ballu_mjx.identification.actuator_choice import physics_commands
+from ballu_mjx.identification.actuator_choice import physics_commands, without_warnings
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.recordings.reference import ReferenceMotions, stack_motions
 from ballu_mjx.residuals.network_config import ForceNetworkConfig
@@ -224,7 +224,8 @@ def _step(
         data.qpos[:], data.qvel[:] = qpos, qvel
         mujoco.mj_getState(model, data, row, kind.mjSTATE_FULLPHYSICS)
     specification = int(kind.mjSTATE_CTRL) | int(kind.mjSTATE_QFRC_APPLIED)
-    state, _ = mujoco.rollout.rollout(model, data, initial, control, control_spec=specification)
+    with without_warnings():
+        state, _ = mujoco.rollout.rollout(model, data, initial, control, control_spec=specification)
     last = np.asarray(state, float)[:, -1]
     expected = substeps * model.opt.timestep
     # MuJoCo resets a simulation that diverges, so its time is then too short.

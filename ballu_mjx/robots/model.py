@@ -37,12 +37,19 @@ def load_model(file: Path, parameters: ModelParameters | None = None) -> mujoco.
 
     With parameters, the constants that MuJoCo derives from masses and inertias are computed again. If the model then
     has dry friction, its solver makes at least `FRICTION_ITERATIONS`.
+
+    Every body's centre of mass and principal axes can be changed. MuJoCo compiles some bodies as simple: a free body
+    without others, for example. It stores only the diagonal of their inertia matrix, and refuses to move their inertial
+    frame. MJX takes over this structure without a word. The loaded model has no such bodies.
     """
     model = mujoco.MjModel.from_xml_path(str(file))
+    if has_simple_bodies(model):
+        spec = mujoco.MjSpec.from_file(str(file))
+        for body in spec.bodies:
+            body.simple = 0
+        model = spec.compile()
     if parameters is not None:
         fields = parameters.fields(model)
-        if fields.keys() & {"body_ipos", "body_iquat"}:
-            model = load_without_simple_bodies(file)
         set_fields(model, fields)
         raise_iterations(model)
         # The softness of contacts, joint limits and friction depends on the inertia matrix at the reference pose.
@@ -50,16 +57,9 @@ def load_model(file: Path, parameters: ModelParameters | None = None) -> mujoco.
     return model
 
 
-def load_without_simple_bodies(file: Path) -> mujoco.MjModel:
-    """Load an MJCF file such that every body's centre of mass and principal axes can be changed.
-
-    MuJoCo compiles some bodies as simple: a free body without others, for example. It stores only the diagonal of their
-    inertia matrix, and refuses to move their inertial frame.
-    """
-    spec = mujoco.MjSpec.from_file(str(file))
-    for body in spec.bodies:
-        body.simple = 0
-    return spec.compile()
+def has_simple_bodies(model: mujoco.MjModel) -> bool:
+    """Return whether MuJoCo stores only the diagonal of a body's inertia matrix (`load_model`)."""
+    return bool(np.any(model.body_simple[1:]))
 
 
 FRICTION_ITERATIONS = 6

@@ -6,7 +6,6 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from ballu_mjx.robots.model import load_without_simple_bodies
 from ballu_mjx.sim.simulator import AugmentedSimulator
 
 DERIVED_FIELDS = ("body_invweight0", "body_subtreemass", "dof_invweight0", "tendon_invweight0")
@@ -16,12 +15,7 @@ DERIVED_FIELDS = ("body_invweight0", "body_subtreemass", "dof_invweight0", "tend
 def improved_model(simulator: AugmentedSimulator) -> mujoco.MjModel:
     """Return the simulator's model for C MuJoCo, with the identified actuators and the residual's model fields."""
     plain = simulator.simulator
-    model = load_without_simple_bodies(simulator.robot.model)
-    for name in dir(model):  # instead of copy.copy, which loses part of a model
-        value = None if name.startswith("_") else getattr(plain.mj_model, name, None)
-        if isinstance(value, np.ndarray) and value.dtype.kind == "f":
-            getattr(model, name)[...] = value
-    model.opt.iterations = plain.mj_model.opt.iterations
+    model = _copy(plain.mj_model)
     for name in dir(plain.model):
         own = None if name.startswith("_") or name in DERIVED_FIELDS else getattr(model, name, None)
         if not isinstance(own, np.ndarray) or own.dtype.kind != "f":
@@ -32,9 +26,15 @@ def improved_model(simulator: AugmentedSimulator) -> mujoco.MjModel:
         # Compare in MJX's precision, so that values that it merely rounds stay unchanged.
         different = now != own.astype(now.dtype)
         own[different] = now[different]
-    # Also if only actuators were identified: the fresh model takes a body's inertial frame for the body's own frame.
     mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
+
+
+def _copy(model: mujoco.MjModel) -> mujoco.MjModel:
+    """Return a copy of a model, with all of its options. `copy.copy` loses part of it."""
+    content = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, content)
+    return mujoco.MjModel.from_binary_path("copy.mjb", {"copy.mjb": content.tobytes()})
 
 
 def site_poses(

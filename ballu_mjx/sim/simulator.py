@@ -18,7 +18,7 @@ from mujoco import mjx
 
 from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.kinematic_trees import mass_shares
-from ballu_mjx.robots.model import ModelParameters, bare_parameters, with_fields
+from ballu_mjx.robots.model import ModelParameters, bare_parameters, has_simple_bodies, with_fields
 from ballu_mjx.sim.derived_constants import ReferencePose, with_derived_constants
 from ballu_mjx.sim.drivetrain import (
     DrivetrainParameters,
@@ -83,7 +83,15 @@ class Simulator:
 
         The fields may be traced. The centre of mass is still computed with the masses of `mj_model`: the added mass of
         the surrounding air is not part of it.
+
+        **Raises** `ValueError` if a body's centre of mass or principal axes change, and the model is not from
+        `robots.model.load_model` and stores only the diagonal of a body's inertia matrix.
         """
+        if fields.keys() & {"body_ipos", "body_iquat"} and has_simple_bodies(self.mj_model):
+            raise ValueError(
+                "The model has bodies that MuJoCo compiled as simple, whose inertial frame cannot be changed; load it "
+                "by `ballu_mjx.robots.model.load_model`, or set `simple = 0` for its bodies in an MjSpec."
+            )
         return self.with_model(
             with_fields(self.model, with_derived_constants(self._reference_pose, self.model, fields))
         )
@@ -189,7 +197,15 @@ class Simulator:
         - `wrench`: force (N) and torque (N m), world frame, on the tracked body and, in further rows, at the robot's
           points.
         - `joint_force`: generalized forces (N, N m, along `mjx.Data.qvel`). None if there are none.
+
+        **Raises** `ValueError` if the last axis of an argument has another size.
         """
+        sizes = [("ctrl", ctrl, self.mj_model.nu), ("wrench", wrench, 6), ("joint_force", joint_force, self.nv)]
+        for name, value, size in sizes:
+            if value is not None and value.shape[-1] != size:
+                raise ValueError(
+                    f"{name} has {value.shape[-1]} entries along its last axis; {self.robot.name} has {size}."
+                )
         commands = self._in_substeps(ctrl)
         sites, bodies, _ = zip(*self._sites[: len(wrench)], strict=True)
         template = self._template
@@ -227,7 +243,7 @@ class Simulator:
         if scale is not None:
             own = {name: getattr(self.model, name) for name in fields}
             fields = {name: (1 - scale) * own[name] + scale * value for name, value in fields.items()}
-        return AugmentedSimulator(self.with_fields(fields), bound, scale)
+        return AugmentedSimulator(self.with_fields(fields), bound, scale, self)
 
 
 class RolloutState(NamedTuple):
@@ -289,6 +305,7 @@ class AugmentedSimulator:
     - `simulator`: the robot's simulator, with the residual's model fields.
     - `residual`: the residual with its parameters, which may be traced. None if there is no residual.
     - `scale`: the fraction of the residual that is applied. None for all of it.
+    - `plain`: the simulator without the residual and its model fields. None if there is no residual.
 
     `Simulator.with_residual` creates an instance. The constructor does not apply the residual's model fields.
     """
@@ -296,6 +313,7 @@ class AugmentedSimulator:
     simulator: Simulator
     residual: BoundResidual | None = None
     scale: Float[Array, ""] | float | None = None
+    plain: Simulator | None = None
 
     @property
     def robot(self) -> RobotDescription:
@@ -314,22 +332,26 @@ class AugmentedSimulator:
 
     def without_residual(self) -> Simulator:
         """Return the simulator without the residual and without its model fields."""
-        return Simulator(self.robot, self.actuators, model=self.simulator.mj_model)
+        return self.simulator if self.plain is None else self.plain
 
     def with_residual(self, residual: HasResidual | None) -> AugmentedSimulator:
         """Return the simulator with a further residual, which acts together with the present one (`SumOfResiduals`).
 
         If `residual` is None, return the simulator itself.
+
+        **Raises** `ValueError` if the present residual has a scale.
         """
         if residual is None:
             return self
-        assert self.scale is None, "A scaled residual takes no further one."
+        if self.scale is not None:
+            raise ValueError("A residual with a scale takes no further one; add it to the simulator without the scale.")
         both = residual.bound if self.residual is None else self.residual.plus(residual.bound)
-        return AugmentedSimulator(self.simulator.with_fields(both.fields), both)
+        return AugmentedSimulator(self.simulator.with_fields(both.fields), both, plain=self.without_residual())
 
     def with_fields(self, fields: Mapping[str, Array]) -> AugmentedSimulator:
         """Return a copy with other model fields; see `Simulator.with_fields`."""
-        return dataclasses.replace(self, simulator=self.simulator.with_fields(fields))
+        plain = None if self.plain is None else self.plain.with_fields(fields)
+        return dataclasses.replace(self, simulator=self.simulator.with_fields(fields), plain=plain)
 
     def with_model(self, model: mjx.Model, params: Any) -> AugmentedSimulator:
         """Return a copy with another MJX model, and with other parameters of the residual; both may be traced.
@@ -341,7 +363,8 @@ class AugmentedSimulator:
 
     def with_drivetrain(self, drivetrain: DrivetrainParameters | None) -> AugmentedSimulator:
         """Return a copy with another drivetrain; see `Simulator.with_drivetrain`."""
-        return dataclasses.replace(self, simulator=self.simulator.with_drivetrain(drivetrain))
+        plain = None if self.plain is None else self.plain.with_drivetrain(drivetrain)
+        return dataclasses.replace(self, simulator=self.simulator.with_drivetrain(drivetrain), plain=plain)
 
     def with_generalized_force(self, force: Float[Array, " nv"]) -> AugmentedSimulator:
         """Return a copy with generalized forces; see `Simulator.with_generalized_force`."""

@@ -7,7 +7,7 @@ import pytest
 from servo_arm import TRUTH, identified, true_path, wandering, write_arm
 
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.identification.actuator_choice import ReplayErrors, _summaries, choose_actuators
+from ballu_mjx.identification.actuator_choice import Choice, ReplayErrors, ReplayRow, _summaries, choose_actuators
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.robots.description import RobotDescription
 
@@ -24,7 +24,7 @@ def motions(robot: RobotDescription) -> list[Motion]:
         commands = wandering(seed, steps)
         qpos, qvel = true_path(robot, identified(robot, **TRUTH), commands)
         states = (np.concatenate([np.zeros((1, 2)), x[9::10]]) for x in (qpos, qvel))
-        found.append(Motion(name, np.arange(steps + 1) * 0.05, commands, *states, fit_error_mm={}))
+        found.append(Motion(name, np.arange(steps + 1) * 0.05, commands, *states, fit_error_mm={}, joints=robot.joints))
     return found
 
 
@@ -78,3 +78,13 @@ def test_choice_refuses_recordings_that_are_too_short(robot: RobotDescription, m
     short = dataclasses.replace(motion, command=motion.command[:10], qpos=motion.qpos[:11], qvel=motion.qvel[:11])
     with pytest.raises(InputError, match=r"near-1: no validation recording lasts 1 s"):
         choose_actuators(robot, identified(robot, **TRUTH), [short])
+
+
+def test_quantities_that_were_not_recorded_decide_nothing():
+    """An anchored robot without recorded hinges is compared by position, and no joint angles are called worse."""
+    first = np.array([[0.1, np.nan], [np.inf, np.nan]])
+    one, other = _summaries(first, first[::-1])
+    assert np.isinf(one.position) and np.isnan(one.joints) and np.isnan(other.joints)
+    row = ReplayRow("near", 1.0, 2, one._replace(position=0.1), other._replace(position=0.2, diverged=2))
+    choice = Choice(None, (row,), "position")  # pyright: ignore[reportArgumentType]
+    assert len(choice.worse) == 1 and choice.worse[0].startswith("position")

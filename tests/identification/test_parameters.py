@@ -318,3 +318,22 @@ def test_any_model_field_can_be_declared_by_its_mujoco_name(tmp_path: Path):
     )
     fields = parameters.fields(model, np.array([0.5]))
     np.testing.assert_allclose(fields["jnt_range"], [[0, 0.5], [0, 0]])
+
+
+def test_default_names_have_letters_digits_and_underscores(tmp_path: Path):
+    parameters, _ = arm(tmp_path, {"joint": "left", "field": "jnt_range", "index": 1, "bounds": [0, 1]})
+    assert parameters.names == ("left_jnt_range_1",)
+
+
+@pytest.mark.parametrize(
+    ("entry", "sentence"),
+    [
+        ({"joint": "left", "field": "dof_invweight0", "bounds": [0, 9]}, "which MuJoCo derives"),
+        ({"actuator": "servo_left", "field": "actuator_damping", "bounds": [0, 9]}, "which MJX does not simulate"),
+        ({"command": "left", "field": "delay", "factor": -1}, "delay must be 0 or more; write a factor above 0"),
+        ({"joint": "left", "field": "frictionloss", "bounds": [0, 1], "factor": -2}, "write a factor above 0"),
+    ],
+)
+def test_fields_and_factors_that_cannot_be_simulated_are_refused(tmp_path: Path, entry: dict, sentence: str):
+    with pytest.raises(InputError, match=sentence):
+        arm(tmp_path, {"targets": [entry]} if "factor" in entry and "bounds" not in entry else entry)

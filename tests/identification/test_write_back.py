@@ -53,8 +53,8 @@ def test_values_on_a_bound_are_read_back(tmp_path: Path):
 
 
 def test_a_field_that_mjcf_cannot_express_is_refused(tmp_path: Path):
-    robot, found = identified(tmp_path, {"joint": "left", "field": "dof_invweight0"})
-    with pytest.raises(InputError, match="dof_invweight0 cannot be written as MJCF"):
+    robot, found = identified(tmp_path, {"geom": "rod", "field": "geom_rbound"})
+    with pytest.raises(InputError, match="geom_rbound cannot be written as MJCF"):
         identified_xml(robot, found)
 
 

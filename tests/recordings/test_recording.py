@@ -241,6 +241,19 @@ def test_short_gaps_are_interpolated_and_counted_by_column(path: Path) -> None:
     assert actual.trimmed == (0, 0)
 
 
+def test_held_quaternions_of_zeros_are_refused_with_column_and_row(path: Path) -> None:
+    """A client that holds the last position of a body it does not see may write such quaternions."""
+    table = load(path)
+    rows = len(table["time"])
+    for axis in "xyz":
+        table[f"balloon_{axis}"][rows - 30 :] = [table[f"balloon_{axis}"][rows - 31]] * 30
+        table[f"balloon_q{axis}"][rows - 30 :] = ["0"] * 30
+    table["balloon_qw"][rows - 30 :] = ["0"] * 30
+    save(table, path)
+    with pytest.raises(InputError, match="column balloon_qw.*length 0 instead of 1"):
+        read_recording(path)
+
+
 def test_orientations_are_interpolated_along_the_shortest_rotation(path: Path) -> None:
     """A constant rate of turn is recovered exactly, for any sign of the quaternions beside the gap."""
     table = load(path)

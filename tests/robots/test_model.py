@@ -17,6 +17,7 @@ from ballu_mjx.robots.description import RobotDescription
 from ballu_mjx.robots.mjcf import write_mjcf
 from ballu_mjx.sim.c_model import improved_model
 from ballu_mjx.sim.simulator import Simulator
+from ballu_mjx.sim.step import state_at
 
 DRONE = """
 <mujoco>
@@ -56,6 +57,39 @@ def robot(folder: Path, name: str, model: str, *entries: dict) -> RobotDescripti
 
 def values(description: RobotDescription, *vector: float) -> IdentifiedParameters:
     return IdentifiedParameters(jnp.asarray(vector), declared_parameters(description, description.load_model()))
+
+
+def test_a_moved_centre_of_mass_moves_in_mjx_as_in_c_mujoco(tmp_path: Path) -> None:
+    """MuJoCo compiles the drone as simple, and MJX would keep the diagonal of its inertia matrix."""
+    description = robot(tmp_path, "drone", DRONE, *COM)
+    moved = mujoco.MjModel.from_xml_string(DRONE.replace('inertial pos="0 0 0"', 'inertial pos="0.05 -0.02 0"'))
+    plain = Simulator(description)
+    start = np.r_[plain.mj_model.qpos0], np.r_[np.zeros(3), 0.0, 0.0, 3.0]
+    other = plain.with_fields({"body_ipos": jnp.asarray(moved.body_ipos)})
+    state = other.step(state_at(*map(jnp.asarray, start)), jnp.asarray([9.81]), jnp.zeros((1, 6)))
+    data = mujoco.MjData(moved)
+    moved.opt.timestep = plain.mj_model.opt.timestep
+    data.qpos[:], data.qvel[:] = start
+    data.ctrl[:] = 9.81
+    mujoco.mj_step(moved, data, plain.substeps)
+    assert np.abs(data.qvel[:2]).max() > 0.05
+    np.testing.assert_allclose(state.qvel, data.qvel, atol=2e-4)
+
+
+def test_a_model_that_is_compiled_as_simple_refuses_another_centre_of_mass(tmp_path: Path) -> None:
+    description = robot(tmp_path, "drone", DRONE, *COM)
+    simulator = Simulator(description, model=mujoco.MjModel.from_xml_string(DRONE))
+    with pytest.raises(ValueError, match="compiled as simple"):
+        simulator.with_fields({"body_ipos": jnp.zeros((2, 3))})
+
+
+def test_the_improved_model_has_the_options_of_an_explicit_model(tmp_path: Path) -> None:
+    description = robot(tmp_path, "drone", DRONE, *COM)
+    moon = description.load_model()
+    moon.opt.gravity[2], moon.opt.timestep, moon.opt.wind[0] = -1.62, 0.0025, 3.0
+    found = improved_model(Simulator(description, model=moon).with_residual(None))
+    for name in ("gravity", "timestep", "wind", "integrator", "iterations"):
+        np.testing.assert_array_equal(getattr(found.opt, name), getattr(moon.opt, name))
 
 
 def acceleration(model: mujoco.MjModel) -> np.ndarray:

@@ -190,3 +190,27 @@ def test_robots_of_several_trees_are_observed_without_the_scene(tmp_path: Path):
         np.testing.assert_allclose(features[place], jacobian @ qvel, atol=1e-5)
     bodies = [model.body(name).id for name in ("left", "rod", "right")]
     np.testing.assert_allclose(com, np.average(data.xipos[bodies], axis=0, weights=model.body_mass[bodies]), atol=1e-6)
+
+
+def test_without_its_residual_a_simulator_keeps_its_other_changes() -> None:
+    """Training runs on the changed simulator, so that validation must, too."""
+    damping = jnp.asarray(SIMULATOR.mj_model.dof_damping, jnp.float32)
+    changed = SIMULATOR.with_fields({"dof_damping": 2 * damping})
+    residual = BoundResidual(Springs(), jnp.asarray(1.0))
+    improved = changed.with_residual(residual)
+    further = improved.with_residual(BoundResidual(PlainPush(), 0.02)).with_fields({"dof_damping": 3 * damping})
+    for simulator, times in ((improved, 2), (further, 3)):
+        for each in (simulator.simulator, simulator.without_residual()):
+            np.testing.assert_array_equal(each.model.dof_damping, times * damping)
+        plain = simulator.without_residual()
+        np.testing.assert_array_equal(plain.model.body_mass, SIMULATOR.model.body_mass)
+    with pytest.raises(ValueError, match="with a scale takes no further one"):
+        changed.with_residual(residual, 0.5).with_residual(residual)
+
+
+@pytest.mark.parametrize(("commands", "force"), [(1, None), (3, None), (2, 1)])
+def test_arguments_of_a_wrong_size_are_refused(start: RolloutState, commands: int, force: int | None):
+    """JAX would apply a single number to all actuators or joints."""
+    joint_force = None if force is None else jnp.zeros(force)
+    with pytest.raises(ValueError, match="entries along its last axis"):
+        SIMULATOR.step(start.physics, jnp.zeros(commands), jnp.zeros((1, 6)), joint_force)

@@ -484,9 +484,10 @@ class ImprovedSimulator:
         """Advance by one physics step under the actuators' `ctrl` and the residual's loads."""
         model, data = self.model, self.data
         data.ctrl[self._actuators] = ctrl
-        data.xfrc_applied[self._bodies] = 0.0
+        # Forces of the caller act, too, and stay unchanged.
+        own = data.xfrc_applied.copy(), data.qfrc_applied.copy()
         for dofs in self._dofs:
-            data.qfrc_applied[dofs] = self.joint_force[dofs]
+            data.qfrc_applied[dofs] = own[1][dofs] + self.joint_force[dofs]
         if len(self.wrench) > 1:  # The torques of forces at points depend on the current positions of the points.
             mujoco.mj_kinematics(model, data)
         for number, (wrench, site, body) in enumerate(zip(self.wrench, self._sites, self._bodies, strict=False)):
@@ -494,6 +495,7 @@ class ImprovedSimulator:
             if number:
                 data.xfrc_applied[body, 3:] += np.cross(data.site_xpos[site] - data.xipos[body], wrench[:3])
         mujoco.mj_step(model, data)
+        data.xfrc_applied[:], data.qfrc_applied[:] = own
 
     def _find(self, kind: mujoco.mjtObj, names: Any) -> np.ndarray:
         """Return the ids of objects of the model. **Raises** `ValueError` if one is missing."""
