@@ -59,7 +59,8 @@ def cut_windows(
         begin = round(skip / motion.sample_timestep)
         found += [(number, first) for first in range(begin, len(motion.qpos) - steps, every)]
     if not found:
-        raise InputError(f"No recording lasts {seconds:g} s; give longer recordings, or shorter windows.")
+        names = ", ".join(motion.name for motion in motions)
+        raise InputError(f"{names}: no recording lasts {seconds:g} s; give longer recordings, or shorter windows.")
     motion, first = np.array(found).T
     return Windows(motion, first, samples)
 

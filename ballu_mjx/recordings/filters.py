@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
+from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.recording import Recording
 
 _TURN_TOLERANCE = 0.1
@@ -49,13 +50,14 @@ def control_grid(recording: Recording, control_timestep: float) -> tuple[int, Fl
 
     The sample rate is close to the recording's own. There are at least two samples per control step.
 
-    **Raises** `ValueError` for a recording shorter than two control steps.
+    **Raises** `InputError` for a recording shorter than two control steps.
     """
     time = recording.time - recording.time[0]
     control_steps = int(np.floor(time[-1] / control_timestep + 1e-6))
     if control_steps < 2:
-        raise ValueError(
-            f"{recording.name}: {time[-1]:.3f} s is too short; at least {2 * control_timestep} s are needed."
+        raise InputError(
+            f"{recording.name}: lasts {time[-1]:.3f} s; give recordings of two control steps or more, "
+            f"{2 * control_timestep:g} s."
         )
     per_step = max(2, round(control_timestep / float(np.median(np.diff(time)))))
     return per_step, np.arange(control_steps * per_step + 1) * (control_timestep / per_step)

@@ -72,9 +72,10 @@ def cut_motion_windows(
     ]
     if not places:
         needed = window_seconds + (history - 1) * simulator.robot.control_timestep
+        names = ", ".join(motion.name for motion in motions)
         raise InputError(
-            f"No recording lasts {needed:g} s, a window and the {history - 1} control steps before it; give longer "
-            "recordings, or reduce --window-seconds."
+            f"{names}: no recording lasts {needed:g} s, a window and the {history - 1} control steps before it; give "
+            "longer recordings, or reduce --window-seconds."
         )
     reference, _ = stack_motions(simulator, motions)
     qpos, qvel, features, command = (np.asarray(x) for x in reference[:4])

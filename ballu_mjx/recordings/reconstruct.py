@@ -67,8 +67,8 @@ def reconstruct(
     - `drivetrain`: parameters of the drivetrain (delay, lag, backlash) between commands and actuators. Joints that
       follow from the commands are computed from its output. None if there is no drivetrain.
 
-    **Raises** `InputError` if the measurements do not determine a joint or do not fit the model. **Raises**
-    `ValueError` for a suspended recording, and for one shorter than two control steps.
+    **Raises** `InputError` if the measurements do not determine a joint or do not fit the model, if a value is missing,
+    and for a recording shorter than two control steps. **Raises** `ValueError` for a suspended recording.
     """
     parameters, hooks = parameters or ReconstructionParameters(), hooks_of(robot)
     simulated = robot.load_model() if model is None else model
@@ -117,8 +117,8 @@ def resample(recording: Recording, model: mujoco.MjModel, robot: RobotDescriptio
 
     A spline would overshoot where jitter brings noisy samples close together.
 
-    **Raises** `ValueError` for a suspended recording, and for one shorter than two control steps. **Raises**
-    `InputError` from `check_complete`.
+    **Raises** `ValueError` for a suspended recording. **Raises** `InputError` from `check_complete`, and for one
+    shorter than two control steps.
     """
     position, quaternion = recording.tracked_position, recording.tracked_quaternion
     if recording.kind != "free" or position is None or quaternion is None:

@@ -34,7 +34,7 @@ _LARGEST_RECURRING = 0.02
 _HELD_JUMP = 2.0
 """Smallest jump at the end of a held pose, in units of the 95th percentile of movements between samples. A rest ends
 with a smaller movement."""
-_QUATERNION_TOLERANCE = 0.02
+QUATERNION_TOLERANCE = 0.02
 """Largest deviation of a quaternion's length from 1."""
 
 
@@ -227,7 +227,7 @@ def check_lengths(path: Path, columns: dict[str, Column], groups: Sequence[Colum
         names = group.names
         with np.errstate(over="ignore"):
             length = np.linalg.norm(np.stack([columns[name] for name in names], 1), axis=1)
-        row = first_true(np.abs(length - 1) > _QUATERNION_TOLERANCE)
+        row = first_true(np.abs(length - 1) > QUATERNION_TOLERANCE)
         if row is not None:
             problem = f"the quaternion {names[0]} ... {names[-1]} has length {length[row]:.3g} instead of 1"
             refuse_recording(path, problem, "export unit quaternions in w, x, y, z order", column=names[0], row=row)

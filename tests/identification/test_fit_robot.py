@@ -266,7 +266,7 @@ def test_diverged_windows_do_not_make_the_scatter_undefined():
 
 
 def test_fit_refuses_unsuitable_input(motions: list[MeasuredMotion], parameters: ParameterSet, tmp_path: Path):
-    with pytest.raises(InputError, match="No recording lasts 60 s"):
+    with pytest.raises(InputError, match="no recording lasts 60 s"):
         fit_robot(parameters, motions, None, FitConfig(window_seconds=60.0))
     with pytest.raises(InputError, match="--interval-seconds is 0.2, less than --window-seconds"):
         fit_robot(parameters, motions, None, FitConfig(window_seconds=0.5, interval_seconds=0.2))

@@ -13,6 +13,7 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from ballu_mjx.common.errors import InputError
+from ballu_mjx.recordings.validation import QUATERNION_TOLERANCE
 
 LENGTHS: Mapping[str, float] = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 """Length of each unit in metres."""
@@ -20,8 +21,6 @@ ANGLES: Mapping[str, float] = {"rad": 1.0, "deg": float(np.pi / 180)}
 """Size of each unit in radians."""
 TIMES: Mapping[str, float] = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """Length of each unit in seconds."""
-QUATERNION_TOLERANCE = 0.02
-"""Tolerance of a quaternion's length, which must be 1."""
 _LARGEST_TURN = 4 * np.pi * 1.001
 """Largest magnitude of an angle (rad): two turns, for unwrapped angles. It detects degrees labelled as radians."""
 
