@@ -15,6 +15,7 @@ from ballu_mjx.common.errors import InputError
 from ballu_mjx.evaluation.open_loop import Evaluators
 from ballu_mjx.identification.actuator_choice import choose_actuators
 from ballu_mjx.identification.stable_time_step import check_stability
+from ballu_mjx.recordings.inverse_kinematics import describe_fit
 from ballu_mjx.recordings.motion import Motion
 from ballu_mjx.residuals.dataset import USES, RecordingsData, ResidualDataset
 from ballu_mjx.residuals.network_config import ForceNetworkConfig
@@ -196,6 +197,9 @@ def prepare(
         _announce(dataset, folder, data.quick)
     simulator = Simulator(robot, dataset.identified)
     motions = dataset.reconstruct(simulator)
+    notice = describe_fit([motion for use in USES for motion in motions[use]])
+    if first and notice is not None:
+        print(notice, flush=True)
     if dataset.identified is not None and resume is None:
         choice = choose_actuators(robot, dataset.identified, motions["validation"])
         if first:

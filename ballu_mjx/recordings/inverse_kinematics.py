@@ -7,14 +7,14 @@ that no measurement shows, and measurements that fit no pose.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import mujoco
 import numpy as np
 from jaxtyping import Float
 
 from ballu_mjx.common.errors import InputError
-from ballu_mjx.recordings.motion import MeasurementGrid, ReconstructionParameters
+from ballu_mjx.recordings.motion import MeasurementGrid, Motion, ReconstructionParameters
 from ballu_mjx.recordings.pose_solver import KinematicProblem, PoseSolver
 from ballu_mjx.recordings.posture_search import PostureSearch
 from ballu_mjx.recordings.recording_hooks import hooks_of
@@ -22,6 +22,9 @@ from ballu_mjx.robots.description import RobotDescription
 
 _WORST_FIT = 0.05
 """Largest RMS distance (m) between measured and fitted positions. Above it, the recording does not fit the model."""
+NOTABLE_FIT_ERROR = 5.0
+"""RMS distance (mm) between measured and fitted positions above which noise does not explain it."""
+_PLACES = "its `offset` in the mapping, its site in the model, and the model's lengths"
 _UNSEEN = 1e-9
 """Information about a direction of motion, relative to the best seen direction, below which no measurement shows it."""
 
@@ -69,9 +72,9 @@ def solve_inverse_kinematics(
     solver = PoseSolver(problem)
     qpos = PostureSearch(solver).solve()
     fit = KinematicFit(problem, qpos, solver.information(qpos, np.arange(len(qpos))))
-    _check_seen(solver, fit, name)
     distance = site_distances(fit)
     worst = max(distance, key=lambda site: distance[site])
+    _check_seen(solver, fit, name, worst, distance[worst])
     if distance[worst] > 1e3 * _WORST_FIT:
         raise InputError(
             f"{name}: the recorded {worst} is {distance[worst]:.0f} mm (RMS) from the model's best fit; measure "
@@ -91,10 +94,13 @@ def site_distances(fit: KinematicFit) -> dict[str, float]:
     }
 
 
-def _check_seen(solver: PoseSolver, fit: KinematicFit, name: str) -> None:
+def _check_seen(solver: PoseSolver, fit: KinematicFit, name: str, worst: str, distance: float) -> None:
     """Check that single samples determine all joints that the adapter does not complete.
 
-    **Raises** `InputError` naming the joint that the median sample determines least.
+    `worst` is the site with the largest RMS distance (mm) between measured and fitted positions.
+
+    **Raises** `InputError` naming the joint that the median sample determines least. If the fit is bad, the posture may
+    be wrong, for example stretched, so the message names the site, too.
     """
     model, robot = fit.problem.model, fit.problem.robot
     completed = [model.joint(joint).dofadr[0] for joint in hooks_of(robot).completed_joints]
@@ -106,7 +112,16 @@ def _check_seen(solver: PoseSolver, fit: KinematicFit, name: str) -> None:
     if seen[middle] < _UNSEEN:
         open_dof = kept[np.argmax(np.abs(vectors[middle, :, 0]))]
         joint = model.joint(int(model.dof_jntid[open_dof])).name
-        raise InputError(
-            f'{name}: nothing that is measured shows the joint {joint}; add it to "joints" of the robot description '
-            "and record it, or add a point that it moves."
-        )
+        fix = 'add it to "joints" of the robot description and record it, or add a point that it moves'
+        if distance > NOTABLE_FIT_ERROR:
+            fix = f"the recorded {worst} is {distance:.0f} mm (RMS) from the model's best fit, so first check {_PLACES}"
+        raise InputError(f"{name}: nothing that is measured shows the joint {joint}; {fix}.")
+
+
+def describe_fit(motions: Sequence[Motion]) -> str | None:
+    """Return a sentence about the largest distance between measured and fitted positions, or None if all are small."""
+    distances = [(error, motion.name, site) for motion in motions for site, error in motion.fit_error_mm.items()]
+    error, name, site = max(distances, default=(0.0, "", ""))
+    if error <= NOTABLE_FIT_ERROR:
+        return None
+    return f"{name}: the recorded {site} is {error:.0f} mm (RMS) from the model's best fit; check {_PLACES}."

@@ -12,6 +12,7 @@ import pytest
 
 from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.csv_format import read_recording, write_recording
+from ballu_mjx.recordings.inverse_kinematics import describe_fit
 from ballu_mjx.recordings.kinematic_tree import KinematicTree
 from ballu_mjx.recordings.reconstruct import reconstruct
 from ballu_mjx.recordings.recording import Recording
@@ -127,6 +128,22 @@ def test_closed_loop_determines_the_unmeasured_joint(tmp_path: Path):
     open_chain = describe(tmp_path, FOURBAR.replace("LOOP", ""), tracked="mid")
     with pytest.raises(InputError, match="nothing that is measured shows the joint jc"):
         reconstruct(capture(robot, qpos), open_chain)
+
+
+def test_a_misplaced_site_is_named(tmp_path: Path):
+    """A wrong offset of a body may also stretch a fitted leg, which then hides how far it is bent."""
+    robot = describe(tmp_path, FOURBAR.replace("LOOP", LOOP), tracked="mid")
+    angle = 0.5 * np.sin(2 * np.pi * 0.5 * np.arange(150) / RATE)
+    recording = capture(robot, np.stack([angle, -angle, angle], axis=1))
+    assert describe_fit([reconstruct(recording, robot)]) is None
+    assert recording.tracked_position is not None
+    moved = dataclasses.replace(recording, tracked_position=recording.tracked_position + [0, 0.02, 0])
+    assert "the recorded mid is 20 mm (RMS) from the model's best fit" in (
+        describe_fit([reconstruct(moved, robot)]) or ""
+    )
+    open_chain = describe(tmp_path, FOURBAR.replace("LOOP", ""), tracked="mid")
+    with pytest.raises(InputError, match="the joint jc; the recorded mid is 20 mm"):
+        reconstruct(moved, open_chain)
 
 
 def test_joint_equality_determines_the_coupled_joint(tmp_path: Path):
