@@ -15,9 +15,8 @@ class LocomotionConfig:
     """Options of the simulator in which a policy is trained."""
 
     domain_randomization: bool = False
-    """Draw friction and the starting state anew for every episode, as in the paper. --friction and the
-    options of start and pushes need it. Masses and buoyancy are not drawn, because they change gaits too
-    much."""
+    """Draw friction and the starting state anew for every episode, as in the paper. --friction and the options of start
+    and pushes need it. Masses and buoyancy are not drawn, because they change gaits too much."""
     friction: tuple[float, float] = (0.5, 1.1)
     """Range of the coefficient of sliding friction. One value is drawn for all geoms that collide. A residual that
     changes the friction (aerodynamic) changes the range by the same factor."""

@@ -6,7 +6,7 @@ import dataclasses
 
 _VANILLA = "vanilla"
 ROUNDS = "envmimic"
-"""Residual that is learned again in each round."""
+"""Residual that is learned again in each round. From the second round on, its name ends with the round's number."""
 
 
 @dataclasses.dataclass(frozen=True)
