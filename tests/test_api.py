@@ -160,6 +160,6 @@ def test_bundled_recordings_and_sweeps_are_refused_for_other_robots(tmp_path: Pa
         bm.identify_actuators(bm.load_recordings("suspended", robot), other)
     with pytest.raises(bm.InputError, match="no such file or folder"):
         bm.load_recordings(tmp_path / "nowhere", robot)
-    with pytest.raises(bm.InputError, match="There are no suspended recordings"):
+    with pytest.raises(bm.InputError, match="There are no recordings to identify"):
         bm.identify_actuators([], robot)
     assert typing.get_type_hints(bm.evaluate)["return"] is bm.Evaluation

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from ballu_mjx.ballu.model import CONTROL_TIMESTEP, SIDES, load_model, standing_qpos
 from ballu_mjx.ballu.reconstruct import BASE_PITCH, _servo_chunk, complete_joints
 from ballu_mjx.ballu.recordings import make_recording
+from ballu_mjx.common.errors import InputError
 from ballu_mjx.recordings.capture_noise import add_capture_noise
 from ballu_mjx.recordings.csv_format import read_recording, write_recording
 from ballu_mjx.recordings.motion import MeasurementGrid, Motion, ReconstructionParameters
@@ -403,5 +404,5 @@ def test_suspended_and_short_recordings_are_refused(truth):
     recording = capture(truth)
     with pytest.raises(ValueError, match="suspended"):
         reconstruct(dataclasses.replace(recording, kind="suspended"), load_robot(), MODEL)
-    with pytest.raises(ValueError, match="too short"):
+    with pytest.raises(InputError, match="lasts 0.070 s; give recordings of two control steps or more"):
         reconstruct(cut(recording, slice(8)), load_robot(), MODEL)
